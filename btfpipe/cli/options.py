@@ -1,0 +1,175 @@
+"""What every command shares: options, summary, progress, exit codes.
+
+Exit codes: 0 done, 1 unforeseen (with traceback), 2 wrong usage or configuration, 3 unusable input,
+4 numerical failure.
+"""
+
+import contextlib
+import functools
+import json
+import re
+import resource
+import sys
+import time
+from pathlib import Path
+
+import click
+
+from btfpipe import __version__, store
+from btfpipe.errors import BtfError
+from btfpipe.parallel import available_threads
+
+
+class Memory(click.ParamType):
+    """An amount of memory such as 512M or 2G, as bytes."""
+
+    name = "size"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, int):
+            return value
+        found = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT]?)B?", str(value).strip().upper())
+        if not found:
+            self.fail(f"{value!r} is not an amount of memory; write 512M or 2G.", param, ctx)
+        return int(float(found[1]) * 1024 ** " KMGT".index(found[2] or " "))
+
+
+def _common(out):
+    """The options that mean the same everywhere."""
+    options = [
+        click.option("-f", "--force", is_flag=True, help="Replace the output if it exists."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+                     help="Seed of everything random; the same seed gives the same bytes."),
+        click.option("-t", "--threads", type=click.IntRange(min=1), default=available_threads,
+                     show_default="all processors", help="Threads; never changes the result."),
+        click.option("--memory", type=Memory(), default="2G", show_default=True,
+                     help="Working memory to stay within, such as 512M or 2G."),
+        click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
+        click.option("-q", "--quiet", is_flag=True, help="No progress, no summary."),
+    ]  # fmt: skip
+    if out:
+        options.insert(
+            0,
+            click.option("-o", "--out", required=out == "required", type=click.Path(path_type=Path),
+                         help="File to write."),
+        )  # fmt: skip
+    return options
+
+
+def stage(out="required"):
+    """Give a command the common options, its summary and its exit codes.
+
+    The command gets only those common options that its signature names. It returns a dict, the part of the
+    summary that only it knows; ``inputs`` in it may be a list of paths, which are replaced by name and digest.
+
+    Parameters
+    ----------
+    out : str or None
+        ``"required"``, ``"optional"``, or None for a command that writes no file.
+    """
+
+    def decorate(command):
+        takes = command.__code__.co_varnames[: command.__code__.co_argcount]
+
+        @functools.wraps(command)
+        def run(force, seed, threads, memory, as_json, quiet, out=None, **kwargs):
+            if out is not None and Path(out).exists() and not force:
+                raise click.UsageError(f"{out} exists; pass --force to replace it.")
+            if out is not None and not Path(out).parent.is_dir():
+                raise click.UsageError(f"{Path(out).parent}: no such folder; make it first.")
+            common = {
+                "out": out, "seed": seed, "threads": threads, "memory": memory, "quiet": quiet,
+                "as_json": as_json,
+            }  # fmt: skip
+            _limit_numba(threads)
+            start = time.perf_counter()
+            try:
+                facts = command(**{k: v for k, v in common.items() if k in takes}, **kwargs)
+                inputs = [_input(path) for path in facts.pop("inputs", [])]
+            except BtfError as error:
+                click.echo(f"Error: {error}", err=True)
+                sys.exit(error.exit_code)
+            summary = {"stage": command.__name__, "btfpipe": __version__, "inputs": inputs}
+            if out is not None:
+                summary["out"] = str(out)
+            summary |= {
+                "parameters": {k: str(v) if isinstance(v, Path) else v for k, v in kwargs.items()},
+                **({"seed": seed} if "seed" in takes else {}),
+                "threads": threads,
+                **facts,
+                "seconds": round(time.perf_counter() - start, 3),
+                "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+            }
+            if as_json:
+                click.echo(json.dumps(summary, default=store._plain))
+            elif not quiet:
+                click.echo(_sentence(summary, facts), err=True)
+
+        for option in reversed(_common(out)):
+            run = option(run)
+        return run
+
+    return decorate
+
+
+def _limit_numba(threads):
+    """Numba reads its thread limit when first imported: say it before any command imports it."""
+    import os
+
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(available_threads()))
+    if "numba" in sys.modules:
+        import numba
+
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+def _input(path):
+    return {"path": str(path), "digest": store.digest(path)}
+
+
+def _sentence(summary, facts):
+    """The summary for a person, on one line."""
+    shown = ", ".join(
+        f"{k.replace('_', ' ')} {v:.4g}" if isinstance(v, float) else f"{k.replace('_', ' ')} {v}"
+        for k, v in facts.items()
+        if isinstance(v, int | float | str)
+    )
+    made = f" → {summary['out']}" if "out" in summary else ""
+    return f"{summary['stage']}{made}: {shown} ({summary['seconds']:.1f} s)"
+
+
+@contextlib.contextmanager
+def progress(label, quiet=False):
+    """Progress on stderr for anything over two seconds; the block gets ``report(done, total)``.
+
+    A bar if stderr is a terminal, otherwise a line every 10 % but at most one in two seconds.
+    """
+    if quiet:
+        yield lambda done, total: None
+        return
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(total=None, desc=label, file=sys.stderr, delay=2, leave=False) as bar:
+
+            def report(done, total):
+                bar.total = total
+                bar.update(done - bar.n)
+
+            yield report
+        return
+    state = {"time": time.monotonic(), "share": 0}
+
+    def log(done, total):
+        share = 10 * done // max(total, 1)
+        now = time.monotonic()
+        if share > state["share"] and now - state["time"] > 2:
+            state.update(time=now, share=share)
+            click.echo(f"{label}: {done} of {total}", err=True)
+
+    yield log
+
+
+def input_file(**kwargs):
+    """Type of a command's input argument: any existing path."""
+    return click.Path(exists=True, path_type=Path, **kwargs)

@@ -1,0 +1,1 @@
+"""What others write: one module a format, in and out."""

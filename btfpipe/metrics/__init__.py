@@ -1,0 +1,1 @@
+"""Errors of pictures and BTFs, each with its formula and unit."""

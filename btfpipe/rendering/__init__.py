@@ -1,0 +1,1 @@
+"""Pictures of dressed surfaces: scene, camera, lights, visibility, shading."""

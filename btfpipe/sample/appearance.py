@@ -1,0 +1,100 @@
+"""The protocol of Sample and Model: what a texel looks like, for any light and view.
+
+Every stage takes either; a new compression is one module with a class that derives from `Appearance`
+and fills in `pictures`, `texels`, `shader` and `nbytes`.
+"""
+
+import numpy as np
+
+from btfpipe.errors import InputError
+
+
+def light_cosines(light_directions):
+    """Cosines (n,) float64 that values are divided by between measured lights; 0.01 at the least."""
+    return np.maximum(np.asarray(light_directions, float)[:, 2], 0.01)
+
+
+class Appearance:
+    """A BTF over one flat patch.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Rows and columns of texels.
+    light_directions, view_directions : (n, 3) float64
+        Unit vectors towards the light and the eye.
+    light_index, view_index : (pairs,) int32
+        Light and view of each pair.
+    toroidal : bool
+        Whether the patch continues at the opposite border.
+    texels_per_mm : float or None
+    """
+
+    @property
+    def n_pairs(self):
+        return len(self.light_index)
+
+    @property
+    def is_product(self):
+        """Whether pair ``view * lights + light`` exists for every view and light, in that order."""
+        lights, views = len(self.light_directions), len(self.view_directions)
+        if self.n_pairs != lights * views:
+            return False
+        pair = np.asarray(self.view_index, np.int64) * lights + self.light_index
+        return bool((pair == np.arange(self.n_pairs)).all())
+
+    def require_product(self, what):
+        """Refuse a list of pairs for a method that needs every view under every light."""
+        if not self.is_product:
+            raise InputError(
+                f"{what} needs every view under every light; this sample is a list of {self.n_pairs} pairs"
+                f" of {len(self.view_directions)} views and {len(self.light_directions)} lights."
+            )
+
+    def pictures(self, pairs):
+        """Linear pictures (n, rows, cols, 3) float32 of the given pairs (a slice or indices)."""
+        raise NotImplementedError
+
+    def texels(self, rows, cols):
+        """Linear values (n, pairs, 3) float32 of the given texels (two index arrays (n,))."""
+        raise NotImplementedError
+
+    def shader(self, interpolation="barycentric"):
+        """An object whose ``shade(row, col, w_i, w_o, out)`` fills ``out`` (n, 3) float32 with values.
+
+        `row`, `col` (n,) float32 are texel coordinates, read bilinearly (wrapping if toroidal, else clamped);
+        `w_i`, `w_o` (n, 3) float32 are unit vectors in the sample's own frame. The call releases the GIL and may
+        run on several threads at once. Between measured lights value / cos(theta_i) is interpolated and
+        multiplied by the true cosine; a light below the horizon gives 0.
+        """
+        raise NotImplementedError
+
+    @property
+    def nbytes(self):
+        """Bytes that the representation takes, tables of directions included."""
+        raise NotImplementedError
+
+    def evaluate(self, row, col, w_i, w_o, *, interpolation="barycentric"):
+        """Values at any texel coordinate, light and view.
+
+        Parameters
+        ----------
+        row, col : (n,) or scalar
+            Texel coordinates; texel (i, j) is centred at row i, col j.
+        w_i, w_o : (n, 3) or (3,)
+            Unit vectors to the light and to the eye, in the sample's frame (s, t, n).
+        interpolation : str
+            Between measured directions: ``barycentric``, ``four`` or ``nearest``.
+
+        Returns
+        -------
+        (n, 3) float32
+            Reflected radiance relative to a perfect white diffuser lit at normal incidence.
+        """
+        row, col, w_i, w_o = (np.asarray(a, np.float32) for a in (row, col, w_i, w_o))
+        n = max(row.size, col.size, w_i.size // 3, w_o.size // 3)
+        arrays = [np.ascontiguousarray(np.broadcast_to(a, (n,))) for a in (row, col)]
+        arrays += [np.ascontiguousarray(np.broadcast_to(a, (n, 3))) for a in (w_i, w_o)]
+        out = np.zeros((n, 3), np.float32)
+        self.shader(interpolation).shade(*arrays, out)
+        return out

@@ -1,0 +1,1 @@
+"""Ray-traced samples: a meso-structure, its materials, and a measurement of it."""

@@ -1,0 +1,360 @@
+"""The container of everything the project writes: one `.npz`, readable by `numpy.load`.
+
+Members are stored, not compressed, and their array data starts at a multiple of 64 bytes, so that
+a reader maps them into memory instead of copying them. One member, ``about.json``, says what the
+file is: kind, format version, parameters, digests of the inputs, program version. Nothing in the file
+depends on the clock, the machine's paths or the number of threads, so equal work gives equal bytes.
+
+A file is written as ``NAME.part`` beside its target and moved into place when complete.
+"""
+
+import contextlib
+import hashlib
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from btfpipe import __version__
+from btfpipe.errors import InputError
+
+ALIGNMENT = 64
+FORMAT_VERSION = 1
+_PADDING_ID = 0xD935  # the extra-field id that alignment tools for zip files use
+_ABOUT = "about.json"
+
+
+@contextlib.contextmanager
+def whole(path, mode="wb"):
+    """Open `path` for writing; it appears only if the block succeeds.
+
+    Parameters
+    ----------
+    path : path-like
+        Target; an existing file is replaced at the end, not before.
+    mode : str
+        As for `open`; text modes are UTF-8.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist, cannot be written, or runs full.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        try:
+            file = part.open(mode, encoding=None if "b" in mode else "utf-8")
+        except OSError as error:
+            raise InputError(_cannot_write(path, error)) from error
+        try:
+            with file:
+                yield file
+            part.replace(path)
+        except OSError as error:
+            if error.filename not in (None, str(part), str(path)):
+                raise  # some other file's trouble, met while writing this one
+            raise InputError(_cannot_write(path, error)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _cannot_write(path, error):
+    return f"{path}: cannot be written ({error.strerror}); choose another --out or make room there."
+
+
+def write_json(path, thing):
+    """Write `thing` as indented JSON, whole or not at all."""
+    with whole(path, "w") as file:
+        json.dump(thing, file, indent=2, default=_plain)
+        file.write("\n")
+
+
+def _plain(thing):
+    """What `json` cannot write by itself: numpy scalars, arrays and paths."""
+    if isinstance(thing, np.generic):
+        return thing.item()
+    if isinstance(thing, np.ndarray):
+        return thing.tolist()
+    if isinstance(thing, Path):
+        return str(thing)
+    raise TypeError(f"{type(thing).__name__} has no JSON form")
+
+
+class Writer:
+    """Writes the members of a container one after the other, streaming.
+
+    Use it through `create`. `array` writes a whole array, `stream` opens a member of known shape to
+    be filled block by block in C order.
+    """
+
+    def __init__(self, file):
+        self._file = file
+        self._zip = zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True)
+
+    def array(self, name, array):
+        """Write one array as member `name`."""
+        array = np.ascontiguousarray(array)
+        with self.stream(name, array.shape, array.dtype) as put:
+            put(array)
+
+    @contextlib.contextmanager
+    def stream(self, name, shape, dtype):
+        """Open member `name` of the given shape; the block gets a function that appends C-order data.
+
+        Raises
+        ------
+        ValueError
+            If the blocks do not add up to the shape.
+        """
+        dtype = np.dtype(dtype)
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(
+            header,
+            {
+                "descr": np.lib.format.dtype_to_descr(dtype),
+                "fortran_order": False,
+                "shape": tuple(int(n) for n in shape),
+            },
+        )
+        expected = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
+        written = 0
+        with self._open(f"{name}.npy", len(header.getvalue())) as member:
+            member.write(header.getvalue())
+
+            def put(block):
+                nonlocal written
+                block = np.ascontiguousarray(block, dtype=dtype)
+                member.write(memoryview(block).cast("B") if block.size else b"")
+                written += block.nbytes
+
+            yield put
+            if written != expected:
+                raise ValueError(f"member {name}: {written} bytes written, {expected} promised")
+
+    def about(self, thing):
+        """Write the description; the last member."""
+        with self._open(_ABOUT, 0) as member:
+            member.write((json.dumps(thing, default=_plain, sort_keys=True) + "\n").encode())
+
+    def _open(self, name, prefix):
+        """Open a member whose data after `prefix` bytes starts at a multiple of 64 bytes."""
+        info = zipfile.ZipInfo(name)  # the zip epoch: no clock time inside
+        info.external_attr = 0o644 << 16
+        zip64_extra = 20  # what zipfile adds to the local header when force_zip64 is set
+        start = self._file.tell() + 30 + len(name.encode()) + zip64_extra + 4 + prefix
+        padding = -start % ALIGNMENT
+        info.extra = struct.pack("<HH", _PADDING_ID, padding) + bytes(padding)
+        return self._zip.open(info, "w", force_zip64=True)
+
+    def close(self):
+        self._zip.close()
+
+
+@contextlib.contextmanager
+def create(path, kind, **about):
+    """Open a container for writing; it appears at `path` only if the block succeeds.
+
+    Parameters
+    ----------
+    path : path-like
+        Target.
+    kind : str
+        What the file holds: ``sample``, ``model``, ``features``, ``surface``, ``map``.
+    **about
+        Plain values for the description (parameters, seed, digests of the inputs). The mapping is
+        passed to the block as ``writer.facts`` and may still be extended there.
+    """
+    with whole(path) as file:
+        writer = Writer(file)
+        writer.facts = about
+        yield writer
+        writer.about(
+            {"kind": kind, "format": FORMAT_VERSION, "btfpipe": __version__, **writer.facts}
+        )
+        writer.close()
+
+
+def write(path, kind, arrays, **about):
+    """Write a dict of arrays and a description at once."""
+    with create(path, kind, **about) as writer:
+        for name, array in arrays.items():
+            writer.array(name, array)
+
+
+class Reader:
+    """A container opened for reading. Arrays are mapped, read-only, when asked for.
+
+    Attributes
+    ----------
+    about : dict
+        The description.
+    path : Path
+        The file.
+    """
+
+    def __init__(self, path, kind=None):
+        self.path = Path(path)
+        self._members = {}
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                if _ABOUT not in archive.namelist():
+                    raise InputError(
+                        f"{path}: a zip file, but not one of btfpipe's (no {_ABOUT} inside)."
+                        f"{_expected(kind)} `btfpipe info {path}` says what it is."
+                    )
+                self.about = json.loads(archive.read(_ABOUT))
+                for info in archive.infolist():
+                    self._members[info.filename] = info
+        except FileNotFoundError as error:
+            raise InputError(f"{path}: no such file.{_expected(kind)}") from error
+        except (zipfile.BadZipFile, OSError, ValueError) as error:
+            raise InputError(
+                f"{path}: not a btfpipe file, or damaged ({error}).{_expected(kind)}"
+                f" `btfpipe info {path}` says what it is."
+            ) from error
+        found = self.about.get("kind")
+        if kind is not None and found not in ((kind,) if isinstance(kind, str) else kind):
+            raise InputError(f"{path}: holds a {found}.{_expected(kind)}")
+        if self.about.get("format", 0) > FORMAT_VERSION:
+            raise InputError(
+                f"{path}: format version {self.about['format']}, written by btfpipe"
+                f" {self.about.get('btfpipe')}; this is {__version__}, which reads up to"
+                f" {FORMAT_VERSION}. Install a newer btfpipe."
+            )
+
+    @property
+    def kind(self):
+        return self.about["kind"]
+
+    def names(self):
+        """Names of the arrays, in the order written."""
+        return [name[:-4] for name in self._members if name.endswith(".npy")]
+
+    def __contains__(self, name):
+        return f"{name}.npy" in self._members
+
+    def __getitem__(self, name):
+        """Map array `name`, read-only."""
+        info = self._members.get(f"{name}.npy")
+        if info is None:
+            raise InputError(f"{self.path}: holds no array {name!r}; it has {self.names()}.")
+        try:
+            return self._map(info)
+        except (ValueError, OSError, EOFError, struct.error) as error:
+            raise InputError(f"{self.path}: array {name!r} is damaged ({error}).") from error
+
+    def _map(self, info):
+        with self.path.open("rb") as file:
+            file.seek(info.header_offset)
+            header = file.read(30)
+            if header[:4] != b"PK\x03\x04":
+                raise ValueError("no local header where the directory says")
+            name_length, extra_length = struct.unpack("<HH", header[26:30])
+            file.seek(info.header_offset + 30 + name_length + extra_length)
+            start = file.tell()
+            version = np.lib.format.read_magic(file)
+            if version != (1, 0):
+                raise ValueError(f"npy version {version}")
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            offset = file.tell()
+        size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+        if fortran or dtype.hasobject or info.file_size != offset - start + size:
+            raise ValueError(f"{info.file_size} bytes do not hold {shape} of {dtype}")
+        if size == 0:
+            return np.zeros(shape, dtype)
+        return np.memmap(self.path, dtype, "r", offset, shape)
+
+    def require(self, name, shape, dtype=None, finite=True):
+        """Map array `name` and check it.
+
+        Parameters
+        ----------
+        name : str
+        shape : tuple
+            Expected shape; None stands for any length.
+        dtype : str, optional
+            Expected kind characters of the dtype, such as ``"f"`` or ``"iu"``.
+        finite : bool
+            Refuse NaN and infinity in floating-point arrays. Leave it out only for bulk data whose
+            reading would cost more than the work that follows.
+
+        Raises
+        ------
+        InputError
+        """
+        array = self[name]
+        if len(array.shape) != len(shape) or any(
+            want is not None and want != have
+            for want, have in zip(shape, array.shape, strict=False)
+        ):
+            wanted = tuple("any" if n is None else n for n in shape)
+            raise InputError(f"{self.path}: {name} has shape {array.shape}; expected {wanted}.")
+        if dtype is not None and array.dtype.kind not in dtype:
+            raise InputError(f"{self.path}: {name} is {array.dtype}; expected kind {dtype!r}.")
+        if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+            bad = int(np.size(array) - np.isfinite(array).sum())
+            raise InputError(f"{self.path}: {name} holds {bad} NaN or infinite values.")
+        return array
+
+    @property
+    def digest(self):
+        """Digest of the content: of the members' names, sizes and checksums (12 hex digits)."""
+        return _members_digest(self._members.values())
+
+
+def _expected(kind):
+    if kind is None:
+        return ""
+    kinds = [kind] if isinstance(kind, str) else list(kind)
+    return f" Expected a {' or '.join(kinds)} made by {' or '.join(_MAKERS[k] for k in kinds)}."
+
+
+_MAKERS = {
+    "sample": "`btfpipe ingest`",
+    "model": "`btfpipe compress`",
+    "features": "`btfpipe textons`",
+    "surface": "`btfpipe surface`",
+    "map": "`btfpipe synthesize`",
+}
+
+
+def read(path, kind=None):
+    """Open a container; see `Reader`. `kind` may be one kind or several."""
+    return Reader(path, kind)
+
+
+def _members_digest(infos):
+    digest = hashlib.sha256()
+    for info in sorted(infos, key=lambda info: info.filename):
+        digest.update(f"{info.filename}\0{info.file_size}\0{info.CRC}\n".encode())
+    return digest.hexdigest()[:12]
+
+
+def digest(path):
+    """Digest of any input, cheap for large ones (12 hex digits).
+
+    Zip files, ours and foreign, by the checksums of their members; folders by the names and sizes of their
+    files; everything else by its bytes.
+    """
+    path = Path(path)
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for file in sorted(p for p in path.rglob("*") if p.is_file()):
+            name = file.relative_to(path).as_posix()
+            digest.update(f"{name}\0{file.stat().st_size}\n".encode())
+        return digest.hexdigest()[:12]
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _members_digest(archive.infolist())
+    except (zipfile.BadZipFile, OSError):
+        pass
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
