@@ -1,0 +1,63 @@
+# `make sample` and `make test` set up everything they need in .venv; other targets likewise.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+CORES ?= all
+SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
+
+export PATH := $(abspath $(BIN)):$(PATH)
+
+.PHONY: all setup sample gallery data-sample test test-slow bench lint fix clean
+
+all: lint test
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"btfpipe needs Python 3.11 or newer; {sys.executable} is {v[0]}.{v[1]}. Pass PYTHON=... to make.")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test,lint]"
+	@touch $@
+
+# The main job: every stage on data-sample/, pictures and a report in results/.
+sample: $(READY)
+	$(SNAKEMAKE) --configfile config/sample.yaml
+	@$(SNAKEMAKE) --configfile config/sample.yaml --report results/sample/report.html --quiet all
+	@echo "Pictures: results/sample/pictures/  Report: results/sample/report.html  Fidelity: results/sample/fidelity.md"
+
+# The same materials, larger surfaces and pictures.
+gallery: $(READY)
+	$(SNAKEMAKE) --configfile config/gallery.yaml
+
+# Remake the simulated materials and the meshes in data-sample/.
+data-sample: $(READY)
+	$(BIN)/python data-sample/make_meshes.py
+	$(BIN)/btfpipe simulate data-sample/weave.yaml -o data-sample/weave.zip --force
+	$(BIN)/btfpipe simulate data-sample/cords.yaml -o data-sample/cords.zip --force
+
+test: $(READY)
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest
+
+bench: $(READY)
+	$(BIN)/python -m pytest benchmarks --benchmark-enable -s -q
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/codespell README.md DESIGN.md CHANGELOG.md config data-sample/README.md btfpipe workflow tests
+	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/snakemake --lint --configfile config/sample.yaml
+
+fix: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/snakefmt Snakefile workflow
+	$(BIN)/python workflow/scripts/config_readme.py
+
+clean:
+	rm -rf results gallery logs .snakemake .benchmarks .pytest_cache .ruff_cache

@@ -1,0 +1,87 @@
+# Validation, wildcards and targets; no rules.
+
+from pathlib import Path
+
+from snakemake.utils import validate
+
+from btfpipe.provenance import source_digest
+
+validate(config, "../schemas/config.schema.yaml")
+
+RESULTS = Path(config["results"]).as_posix().rstrip("/")
+LOOKS = config["looks"]
+PLAIN_LOOKS = [name for name, look in LOOKS.items() if look.get("plain")]
+TRUE_SAMPLES = [name for name, sample in config["samples"].items() if "truth" in sample]
+
+
+def check_names():
+    """Refuse a look whose sample or surface the config does not define."""
+    for name, look in LOOKS.items():
+        for key in ("sample", "surface"):
+            if look[key] not in config[f"{key}s"]:
+                raise WorkflowError(
+                    f"looks.{name}.{key} is {look[key]!r}; expected one of"
+                    f" {', '.join(config[f'{key}s'])}."
+                )
+
+
+check_names()
+
+
+wildcard_constraints:
+    sample="|".join(map(re.escape, config["samples"])),
+    surface="|".join(map(re.escape, config["surfaces"])),
+    look="|".join(map(re.escape, LOOKS)),
+    scene="|".join(map(re.escape, config["scenes"])),
+
+
+def at(pattern):
+    """Path of a result."""
+    return f"{RESULTS}/{pattern}"
+
+
+def option(flag, value):
+    """A command-line option, or nothing where the config leaves it out."""
+    if value is None:
+        return ""
+    values = value if isinstance(value, (list, tuple)) else [value]
+    return " ".join([flag, *map(str, values)])
+
+
+def sample_options(wildcards):
+    """Options of `btfpipe ingest` for a sample."""
+    sample = config["samples"][wildcards.sample]
+    return " ".join(
+        filter(
+            None,
+            [option("--transfer", sample.get("transfer")), option("--crop", sample.get("crop"))],
+        )
+    )
+
+
+def of_look(key):
+    """A function that gives a look's entry."""
+    return lambda wildcards: LOOKS[wildcards.look].get(key)
+
+
+def look_file(pattern):
+    """A function that gives the file of a look's sample or surface."""
+    return lambda wildcards: at(pattern).format(**LOOKS[wildcards.look])
+
+
+def all_pictures():
+    """Every look in every scene, and the looks that are compared with a plain texture."""
+    return expand(
+        at("pictures/{look}.{scene}.png"), look=LOOKS, scene=config["scenes"]
+    ) + expand(
+        at("pictures/{look}.{scene}.btf-and-texture.png"),
+        look=PLAIN_LOOKS,
+        scene=list(config["scenes"])[:1],
+    )
+
+
+def all_fidelity():
+    """The table of errors, and the pictures of errors of each Model."""
+    return [at("fidelity.md")] + expand(
+        at("fidelity/{sample}.model.png"), sample=config["samples"]
+    )

@@ -1,0 +1,25 @@
+rule compress:
+    input:
+        sample=at("samples/{sample}.sample.npz"),
+    output:
+        model=at("models/{sample}.model.npz"),
+        summary=at("summaries/compress/{sample}.json"),
+    log:
+        at("logs/compress/{sample}.log"),
+    benchmark:
+        at("benchmarks/compress/{sample}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=3000,
+    params:
+        components=lookup("compress/components", within=config),
+        seed=lookup("seed", within=config),
+        code=source_digest("compression", "sample", "cli/compress.py", "store.py"),
+    message:
+        "compressing {wildcards.sample} to {params.components} terms"
+    shell:
+        "btfpipe compress {input.sample} --method svd --components {params.components}"
+        " --seed {params.seed} --threads {threads}"
+        " --out {output.model} --json > {output.summary} 2> {log}"

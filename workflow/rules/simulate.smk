@@ -1,0 +1,27 @@
+rule simulate_truth:
+    input:
+        spec=lambda wildcards: lookup(
+            f"samples/{wildcards.sample}/truth/spec", within=config
+        ),
+        pairs=lambda wildcards: lookup(
+            f"samples/{wildcards.sample}/truth/pairs", within=config
+        ),
+    output:
+        stack=at("samples/{sample}.truth.zip"),
+        summary=at("summaries/simulate/{sample}.json"),
+    log:
+        at("logs/simulate/{sample}.log"),
+    benchmark:
+        at("benchmarks/simulate/{sample}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=2000,
+    params:
+        code=source_digest("simulation", "cli/simulate.py", "store.py", "formats"),
+    message:
+        "simulating {wildcards.sample} at directions that nobody measured"
+    shell:
+        "btfpipe simulate {input.spec} --directions {input.pairs} --format exr"
+        " --threads {threads} --out {output.stack} --json > {output.summary} 2> {log}"

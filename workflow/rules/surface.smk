@@ -1,0 +1,28 @@
+rule surface:
+    input:
+        mesh=lambda wildcards: config["surfaces"][wildcards.surface]["mesh"],
+        field=lambda wildcards: config["surfaces"][wildcards.surface].get("field", []),
+    output:
+        surface=at("surfaces/{surface}.surface.npz"),
+        summary=at("summaries/surface/{surface}.json"),
+    log:
+        at("logs/surface/{surface}.log"),
+    benchmark:
+        at("benchmarks/surface/{surface}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=4000,
+    params:
+        vertices=lambda wildcards: config["surfaces"][wildcards.surface]["vertices"],
+        field=lambda wildcards, input: option("--field", input.field or None),
+        levels=lookup("textons/levels", within=config),
+        seed=lookup("seed", within=config),
+        code=source_digest("surface", "cli/surface.py", "formats", "store.py"),
+    message:
+        "resampling {wildcards.surface} to {params.vertices} vertices"
+    shell:
+        "btfpipe surface {input.mesh} --vertices {params.vertices} {params.field}"
+        " --levels {params.levels} --seed {params.seed} --threads {threads}"
+        " --out {output.surface} --json > {output.summary} 2> {log}"

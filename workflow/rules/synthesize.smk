@@ -1,0 +1,30 @@
+rule synthesize:
+    input:
+        features=look_file("features/{sample}.features.npz"),
+        surface=look_file("surfaces/{surface}.surface.npz"),
+    output:
+        map=at("maps/{look}.map.npz"),
+        summary=at("summaries/synthesize/{look}.json"),
+    log:
+        at("logs/synthesize/{look}.log"),
+    benchmark:
+        at("benchmarks/synthesize/{look}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 1
+    resources:
+        mem_mb=3000,
+    params:
+        k=of_look("k"),
+        turn=of_look("turn_deg"),
+        scale=lambda wildcards: option(
+            "--texels-per-unit", LOOKS[wildcards.look].get("texels_per_unit")
+        ),
+        seed=lookup("seed", within=config),
+        code=source_digest("synthesis", "surface", "analysis", "cli/synthesize.py"),
+    message:
+        "growing {wildcards.look}"
+    shell:
+        "btfpipe synthesize {input.features} {input.surface} -k {params.k}"
+        " --turn-deg {params.turn} {params.scale} --seed {params.seed} --threads {threads}"
+        " --out {output.map} --json > {output.summary} 2> {log}"

@@ -1,0 +1,27 @@
+rule textons:
+    input:
+        model=at("models/{sample}.model.npz"),
+    output:
+        features=at("features/{sample}.features.npz"),
+        summary=at("summaries/textons/{sample}.json"),
+    log:
+        at("logs/textons/{sample}.log"),
+    benchmark:
+        at("benchmarks/textons/{sample}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=3000,
+    params:
+        textons=lookup("textons/textons", within=config),
+        images=lookup("textons/images", within=config),
+        levels=lookup("textons/levels", within=config),
+        seed=lookup("seed", within=config),
+        code=source_digest("analysis", "compression", "cli/textons.py", "store.py"),
+    message:
+        "extracting {params.textons} surface textons of {wildcards.sample}"
+    shell:
+        "btfpipe textons {input.model} --textons {params.textons} --images {params.images}"
+        " --levels {params.levels} --seed {params.seed} --threads {threads}"
+        " --out {output.features} --json > {output.summary} 2> {log}"
