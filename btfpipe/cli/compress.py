@@ -1,0 +1,89 @@
+"""`btfpipe compress`: Samples to a Model."""
+
+import click
+
+from btfpipe.cli.options import input_file, progress, stage
+
+
+@click.command()
+@click.argument("samples", nargs=-1, required=True, type=input_file())
+@click.option(
+    "--method",
+    type=click.Choice(["svd"]),
+    default="svd",
+    show_default=True,
+    help="svd: full-matrix singular value decomposition (Zhou et al. 2005).",
+)
+@click.option(
+    "--components",
+    type=click.IntRange(min=1),
+    default=40,
+    show_default=True,
+    help="Terms of the sum; at most the lesser of texels and three channels a pair.",
+)
+@click.option(
+    "--precision",
+    type=click.Choice(["half", "single"]),
+    default="half",
+    show_default=True,
+    help="Numbers in the file: 2 or 4 bytes each.",
+)
+@click.option(
+    "--iterations",
+    type=click.IntRange(min=0),
+    help="Power iterations; by default as many as the error needs.",
+)
+@stage()
+def compress(samples, method, components, precision, iterations, out, seed, threads, memory, quiet):
+    """Make a Model that stands for a Sample, in a fraction of its bytes.
+
+    The Model's error is measured on the file's own factors, over all linear values.
+
+    \b
+    Example:
+      btfpipe compress corduroy.sample.npz -o corduroy.model.npz --components 40
+    """  # fmt: skip
+    from btfpipe import store
+    from btfpipe.compression.svd import compress_svd
+    from btfpipe.metrics import raw_bytes
+    from btfpipe.sample import Sample
+
+    if len(samples) > 1:
+        raise click.UsageError(f"method {method} takes one sample; {len(samples)} are given.")
+    sample = Sample.open(samples[0])
+    with progress("compress: pictures read", quiet) as report:
+        model = compress_svd(
+            sample,
+            components,
+            iterations=iterations,
+            precision=precision,
+            seed=seed,
+            threads=threads,
+            memory=memory,
+            on_progress=report,
+        )
+    model.about |= {
+        "seed": seed,
+        "sample": store.digest(samples[0]),
+        "source": sample.about.get("source"),
+    }
+    model.save(out)
+    size, raw = out.stat().st_size, raw_bytes(sample)
+    facts = {
+        k: v
+        for k, v in model.about.items()
+        if k not in ("singular_values", "seed", "sample", "source")
+    }
+    warnings = []
+    if model.n_terms < components:
+        warnings.append(
+            f"the sample's rank is {model.n_terms}: {components - model.n_terms} terms left out"
+        )
+    return {
+        "inputs": list(samples),
+        **facts,
+        "bytes": size,
+        "sample_bytes": raw,
+        "ratio": raw / size,
+        "warnings": warnings,
+    }
