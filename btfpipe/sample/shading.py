@@ -1,0 +1,244 @@
+"""Shading straight from a Sample, and the interpolation weights that every shader of a product shares."""
+
+import os
+
+import numpy as np
+from numba import njit, prange, types
+from numba.extending import overload
+
+from btfpipe.directions import Hemisphere
+from btfpipe.directions.interpolation import find
+from btfpipe.errors import InputError
+from btfpipe.sample.appearance import light_cosines
+
+_BLOCK = 64  # texels whose pairs are gathered together: a line of the cache is then read once
+
+
+class RawShader:
+    """Evaluates a Sample between its texels, lights and views.
+
+    Holds the codes in texel-major order ``(texel, view, light, channel)``, so that the pictures blended at one
+    texel lie together: one copy of the Sample in memory, made once and shared by all shaders of it.
+
+    Parameters
+    ----------
+    sample : Sample
+        A product of views and lights.
+    interpolation : str
+        ``barycentric``, ``four`` or ``nearest``.
+
+    Raises
+    ------
+    InputError
+        If the Sample is not a product, or its copy does not fit the machine.
+    """
+
+    def __init__(self, sample, interpolation="barycentric"):
+        sample.require_product("shading")
+        self.rows, self.cols = sample.shape
+        self.toroidal = sample.toroidal
+        self.lights = Hemisphere(sample.light_directions, interpolation).tables
+        self.views = Hemisphere(sample.view_directions, interpolation).tables
+        self.inverse_cosines = 1 / light_cosines(sample.light_directions)
+        self.codes = texel_major(sample)
+        self.table = _table(sample)
+        self.gain = np.zeros((0, 3), np.float32)
+        if sample.gain is not None:
+            self.gain = np.ascontiguousarray(sample.gain, np.float32).reshape(-1, 3)
+
+    def shade(self, row, col, w_i, w_o, out):
+        """Fill `out`; see `Appearance.shader`."""
+        _shade(
+            self.codes, self.table, self.gain, self.rows, self.cols, self.toroidal,
+            self.lights, self.inverse_cosines, self.views, row, col, w_i, w_o, out,
+        )  # fmt: skip
+
+
+def texel_major(sample):
+    """Codes of a Sample as (texels, pairs * 3), kept with it; float16 as their bits.
+
+    Raises
+    ------
+    InputError
+        If the copy would take more than half of the machine's memory.
+    """
+    cached = getattr(sample, "_texel_major", None)
+    if cached is not None:
+        return cached
+    need = int(sample.codes.nbytes)
+    have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if need > have // 2:
+        raise InputError(
+            f"shading from this sample keeps a copy of {need / 1e9:.1f} GB in memory and the machine has"
+            f" {have / 1e9:.1f} GB; `btfpipe compress` makes a Model that takes far less."
+        )
+    pairs, rows, cols, _ = sample.codes.shape
+    codes = np.ascontiguousarray(sample.codes).reshape(pairs, rows * cols, 3)
+    if codes.dtype == np.float16:
+        codes = codes.view(np.uint16)
+    out = np.empty((rows * cols, pairs * 3), codes.dtype)
+    _transpose(codes, out)
+    sample._texel_major = out
+    return out
+
+
+def _table(sample):
+    """Linear value of every code; for float32 samples the scale alone."""
+    from btfpipe.sample.transfer import decode_table
+
+    if sample.codes.dtype == np.float32:
+        if sample.transfer != "linear":
+            raise InputError(
+                f"a float32 sample with transfer {sample.transfer!r} cannot be shaded; ingest it as linear."
+            )
+        return np.array([sample.scale], np.float32)
+    return decode_table(sample.codes.dtype, sample.transfer, sample.scale)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _transpose(codes, out):
+    """(pairs, texels, 3) into (texels, pairs * 3), a block of texels at a time."""
+    pairs, texels, _ = codes.shape
+    for block in prange((texels + _BLOCK - 1) // _BLOCK):
+        first = block * _BLOCK
+        last = min(first + _BLOCK, texels)
+        for pair in range(pairs):
+            for texel in range(first, last):
+                for c in range(3):
+                    out[texel, pair * 3 + c] = codes[pair, texel, c]
+
+
+def _value(table, code):
+    """Linear value of a code: by look-up for integers, by scale for floats."""
+    return table[code] if np.issubdtype(type(code), np.integer) else table[0] * code
+
+
+@overload(_value, inline="always")
+def _overload_value(table, code):
+    if isinstance(code, types.Integer):
+        return lambda table, code: table[code]
+    return lambda table, code: table[0] * code
+
+
+@njit(cache=True, nogil=True)
+def pair_weights(lights, inverse_cosines, views, w_i, w_o, index, weight, pair, share):
+    """Pairs and weights that stand for one light and view of a product.
+
+    Parameters
+    ----------
+    lights, views : HemisphereTables
+    inverse_cosines : (lights,) float64
+        Between lights, value / cos(theta_i) is interpolated and multiplied by the true cosine.
+    w_i, w_o : (3,) float32
+        Unit vectors in the sample's frame.
+    index, weight : (2, 4) int32, (2, 4) float64
+        Scratch.
+    pair, share : (16,) int32, (16,) float32
+        Filled in place; entries of weight 0 are left out.
+
+    Returns
+    -------
+    int
+        How many entries are used; 0 for a light below the horizon.
+    """
+    cosine = w_i[2]
+    if cosine <= 0.0:
+        return 0
+    n_lights = find(lights, w_i[0], w_i[1], cosine, index[0], weight[0])
+    n_views = find(views, w_o[0], w_o[1], w_o[2], index[1], weight[1])
+    count = lights.vectors.shape[0]
+    for i in range(n_lights):
+        weight[0, i] *= cosine * inverse_cosines[index[0, i]]
+    used = 0
+    for o in range(n_views):
+        for i in range(n_lights):
+            w = weight[1, o] * weight[0, i]
+            if w != 0.0:
+                pair[used] = index[1, o] * count + index[0, i]
+                share[used] = w
+                used += 1
+    return used
+
+
+@njit(cache=True, nogil=True)
+def corners(row, col, rows, cols, toroidal, texel, share):
+    """Texels (4,) around a coordinate and their bilinear weights (4,), filled in place."""
+    if toroidal:
+        row -= np.floor(row / rows) * rows
+        col -= np.floor(col / cols) * cols
+    else:
+        row = min(max(row, 0.0), rows - 1.0)
+        col = min(max(col, 0.0), cols - 1.0)
+    i = int(row)
+    j = int(col)
+    y = row - i
+    x = col - j
+    i %= rows
+    j %= cols
+    below = (i + 1) % rows
+    right = (j + 1) % cols
+    texel[0] = i * cols + j
+    texel[1] = i * cols + right
+    texel[2] = below * cols + j
+    texel[3] = below * cols + right
+    share[0] = (1.0 - y) * (1.0 - x)
+    share[1] = (1.0 - y) * x
+    share[2] = y * (1.0 - x)
+    share[3] = y * x
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _shade(
+    codes,
+    table,
+    gain,
+    rows,
+    cols,
+    toroidal,
+    lights,
+    inverse_cosines,
+    views,
+    row,
+    col,
+    w_i,
+    w_o,
+    out,
+):
+    index = np.zeros((2, 4), np.int32)
+    weight = np.zeros((2, 4))
+    pair = np.zeros(16, np.int32)
+    share = np.zeros(16, np.float32)
+    texel = np.zeros(4, np.int64)
+    bilinear = np.zeros(4, np.float32)
+    for q in range(len(row)):
+        used = pair_weights(
+            lights, inverse_cosines, views, w_i[q], w_o[q], index, weight, pair, share
+        )
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
+        red = np.float32(0)
+        green = np.float32(0)
+        blue = np.float32(0)
+        if used > 0:
+            for k in range(4):
+                if bilinear[k] == 0.0:
+                    continue
+                r = np.float32(0)
+                g = np.float32(0)
+                b = np.float32(0)
+                line = codes[texel[k]]
+                for p in range(used):
+                    at = 3 * pair[p]
+                    w = share[p]
+                    r += w * _value(table, line[at])
+                    g += w * _value(table, line[at + 1])
+                    b += w * _value(table, line[at + 2])
+                if len(gain) > 0:
+                    r *= gain[texel[k], 0]
+                    g *= gain[texel[k], 1]
+                    b *= gain[texel[k], 2]
+                red += bilinear[k] * r
+                green += bilinear[k] * g
+                blue += bilinear[k] * b
+        out[q, 0] = red
+        out[q, 1] = green
+        out[q, 2] = blue
