@@ -5,7 +5,10 @@ multiplied in.
 """
 
 import os
+import shutil
 import tempfile
+import threading
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,112 @@ from btfpipe import store
 from btfpipe.errors import InputError
 
 _MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+_MAX_PIXELS = 2**28
+
+# First bytes of the formats, and the ending that each is known by.
+_SIGNATURES = [
+    (b"\xff\xd8\xff", ".jpg"),
+    (b"\x89PNG\r\n\x1a\n", ".png"),
+    (b"\x76\x2f\x31\x01", ".exr"),
+    (b"#?R", ".hdr"),
+    (b"II*\0", ".tif"),
+    (b"MM\0*", ".tif"),
+    (b"BM", ".bmp"),
+    (b"GIF8", ".gif"),
+    (b"RIFF", ".webp"),
+]
+_ALIASES = {".jpeg": ".jpg", ".tiff": ".tif"}
+
+# A decoded picture: the array, the names of its channels, and the ending its content (not its name) calls for.
+Picture = namedtuple("Picture", "values channels suffix")
+
+
+def picture_suffix(head):
+    """The ending that a picture's first bytes call for, or None."""
+    return next((suffix for start, suffix in _SIGNATURES if head.startswith(start)), None)
+
+
+def is_mislabelled(name, suffix):
+    """Whether a picture's name ends otherwise than its content calls for."""
+    ending = Path(name).suffix.lower()
+    return ending != "" and _ALIASES.get(ending, ending) != suffix
+
+
+class Decoder:
+    """Decodes pictures held in memory, on any number of threads at once.
+
+    The library's Python side reads files only, so each thread passes its pictures through one small file that lives
+    in memory where the machine has such a place. Use as a context manager.
+    """
+
+    def __enter__(self):
+        self._folder = Path(tempfile.mkdtemp(prefix="btfpipe-", dir=_MEMORY))
+        return self
+
+    def __exit__(self, *_):
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def decode(self, data, name):
+        """Decode the bytes of a picture.
+
+        Parameters
+        ----------
+        data : bytes
+            Contents of a picture file; the format is told by the content, not by the name.
+        name : str
+            What messages call the picture.
+
+        Returns
+        -------
+        Picture
+
+        Raises
+        ------
+        InputError
+            If it is empty, truncated, damaged, or not a picture.
+        """
+        if not len(data):
+            raise InputError(f"{name}: empty; expected a picture.")
+        suffix = picture_suffix(bytes(data[:16]))
+        path = self._folder / f"{threading.get_ident()}{suffix or Path(name).suffix.lower()}"
+        try:
+            path.write_bytes(data)
+        except OSError as error:
+            raise InputError(
+                f"{self._folder}: no room for a decoded picture ({error.strerror}); make room there."
+            ) from error
+        return _decode_file(path, name, suffix)
+
+
+def _decode_file(path, name, suffix):
+    """Decode the picture file at `path`; messages call it `name`."""
+    import OpenImageIO as oiio
+
+    def reason(text):
+        lines = (text or "unknown format").replace(f' ("{path}")', "").replace(str(path), str(name))
+        return lines.strip().splitlines()[0].rstrip(".")
+
+    opened = oiio.ImageInput.open(str(path), _config(oiio))
+    if opened is None:
+        problem = reason(oiio.geterror())
+        if suffix is None:
+            raise InputError(f"{name}: not a readable picture ({problem}).")
+        raise InputError(f"{name}: truncated or damaged picture ({problem}).")
+    spec = opened.spec()
+    if spec.width * spec.height > _MAX_PIXELS:
+        opened.close()
+        raise InputError(
+            f"{name}: declares {spec.height} x {spec.width} pixels; expected a picture of at most"
+            f" {_MAX_PIXELS} pixels."
+        )
+    kinds = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16, oiio.HALF: oiio.HALF}
+    values = opened.read_image(kinds.get(spec.format.basetype, oiio.FLOAT))
+    problem = opened.geterror()
+    opened.close()
+    if values is None or problem:
+        raise InputError(f"{name}: truncated or damaged picture ({reason(problem)}).")
+    values = values.reshape(spec.height, spec.width, spec.nchannels)
+    return Picture(values, tuple(spec.channelnames), suffix or "." + opened.format_name())
 
 
 def read_picture(source, name=None):
@@ -22,7 +131,7 @@ def read_picture(source, name=None):
     Parameters
     ----------
     source : path-like or bytes
-        File, or the contents of one; then `name` tells the format by its ending.
+        File, or the contents of one.
     name : str, optional
         What messages call the picture.
 
@@ -36,32 +145,49 @@ def read_picture(source, name=None):
     InputError
         If the file is missing, empty, truncated, or not a picture.
     """
-    import OpenImageIO as oiio
-
-    name = str(name or source)
     if isinstance(source, bytes | bytearray | memoryview):
-        # the library's Python side reads files only: give it one that lives in memory where there is such a place
-        with tempfile.TemporaryDirectory(dir=_MEMORY) as folder:
-            path = Path(folder) / ("picture" + Path(name).suffix.lower())
-            path.write_bytes(source)
-            return read_picture(path, name)
-    path = Path(source)
+        with Decoder() as decoder:
+            return decoder.decode(source, str(name or "picture")).values
+    return open_picture(source, name).values
+
+
+def open_picture(path, name=None):
+    """As `read_picture` from a path, with channel names and format: a `Picture`."""
+    path, name = Path(path), str(name or path)
     if not path.is_file():
         raise InputError(f"{name}: no such file; expected a picture.")
-    if path.stat().st_size == 0:
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as error:
+        raise InputError(f"{name}: cannot be read ({error.strerror}).") from error
+    if not head:
         raise InputError(f"{name}: empty; expected a picture.")
-    opened = oiio.ImageInput.open(str(path), _config(oiio))
-    if opened is None:
-        raise InputError(f"{name}: not a readable picture ({_first_line(oiio.geterror())}).")
-    spec = opened.spec()
-    native = spec.format.basetype
-    kind = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16, oiio.HALF: oiio.HALF}
-    picture = opened.read_image(kind.get(native, oiio.FLOAT))
-    problem = opened.geterror()
-    opened.close()
-    if picture is None or problem:
-        raise InputError(f"{name}: truncated or damaged picture ({_first_line(problem)}).")
-    return picture.reshape(spec.height, spec.width, spec.nchannels)
+    return _decode_file(path, name, picture_suffix(head))
+
+
+def colours(picture, name):
+    """The three colour channels of a `Picture`; grey is repeated, alpha and other layers are left out.
+
+    Returns
+    -------
+    (rows, cols, 3) array
+        Of the picture's own type.
+
+    Raises
+    ------
+    InputError
+        If the picture has neither grey nor red, green and blue.
+    """
+    values, channels = picture.values, [c.upper() for c in picture.channels]
+    if all(c in channels for c in "RGB"):
+        index = [channels.index(c) for c in "RGB"]
+        return values[..., :3] if index == [0, 1, 2] else values[..., index]
+    if len(channels) <= 2:
+        return np.repeat(values[..., :1], 3, axis=2)
+    raise InputError(
+        f"{name}: has the channels {', '.join(picture.channels)}; expected R, G and B, or grey."
+    )
 
 
 def _config(oiio):
@@ -95,7 +221,12 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
     picture = np.ascontiguousarray(picture)
     if picture.ndim == 2:
         picture = picture[..., None]
-    kinds = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float16": oiio.HALF, "float32": oiio.FLOAT}
+    kinds = {
+        "uint8": oiio.UINT8,
+        "uint16": oiio.UINT16,
+        "float16": oiio.HALF,
+        "float32": oiio.FLOAT,
+    }
     kind = kinds[str(picture.dtype)]
     rows, cols, channels = picture.shape
     spec = oiio.ImageSpec(cols, rows, channels, oiio.HALF if half else kind)

@@ -1,20 +1,39 @@
 """UBO2003, the layout of Bonn's measurements: one picture a pair, its angles in its name.
 
 Names look like ``00008 tl000 pl000 tv030 pv030.jpg``: light and view, polar angle and azimuth, degrees; folders are
-named after the view. Only the keyed angles count.
+named after the view. Only the keyed angles count. A set that was simulated carries ``btfpipe.json``, which says what
+Bonn's sets leave open: white, transfer, toroidal, texels_per_mm.
 """
 
+import contextlib
+import json
 import re
+from pathlib import Path, PurePosixPath
 
+import numpy as np
+
+from btfpipe.directions import from_angles
+from btfpipe.errors import InputError
+from btfpipe.formats.archive import open_archive
+from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.sample.measurement import Measurement
+from btfpipe.sample.transfer import TRANSFERS
+
+SETTINGS = "btfpipe.json"
+_ENDINGS = (".jpg", ".jpeg", ".png", ".exr")
 _KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
 def parse_name(name):
-    """Light and view angles ((theta, phi), (theta, phi)) in degrees from a base name, or None."""
-    found = {key.lower(): float(value) for key, value in _KEYS.findall(name)}
-    if len(found) != 4:
+    """Light and view angles ((theta, phi), (theta, phi)) in degrees from a base name, or None.
+
+    Each key must occur exactly once; their order, case and what stands between them do not matter.
+    """
+    found = [(key.lower(), float(value)) for key, value in _KEYS.findall(name)]
+    angles = dict(found)
+    if len(found) != 4 or len(angles) != 4:
         return None
-    return (found["tl"], found["pl"]), (found["tv"], found["pv"])
+    return (angles["tl"], angles["pl"]), (angles["tv"], angles["pv"])
 
 
 def pair_name(number, light_deg, view_deg, suffix):
@@ -28,3 +47,173 @@ def _angle(value):
     whole, _, part = f"{value:.6f}".partition(".")
     part = part.rstrip("0")
     return f"{int(whole):03d}" + (f".{part}" if part else "")
+
+
+class Listing:
+    """What the names in a folder or zip say, before any picture is read.
+
+    Attributes
+    ----------
+    pairs : dict
+        Name of each (view, light), both (theta, phi) in degrees, in order of view, then light.
+    duplicates : list of (str, str)
+        Names that stand for one pair; the first is the one in `pairs`.
+    strays : list of str
+        Files that are no pictures of a pair.
+    settings : dict
+        Of a simulated set's ``btfpipe.json``.
+    """
+
+    def __init__(self, archive):
+        pairs, self.duplicates, self.strays, self.settings = {}, [], [], {}
+        for name in archive.names:
+            base = PurePosixPath(name).name
+            hidden = base.startswith(".") or "__MACOSX/" in name
+            angles = parse_name(base)
+            if base == SETTINGS:
+                self.settings = _settings(archive, name)
+            elif angles is None or hidden or not base.lower().split(" (")[0].endswith(_ENDINGS):
+                self.strays.append(name)
+            else:
+                light, view = (_direction(a, archive.label(name)) for a in angles)
+                if (view, light) in pairs:
+                    self.duplicates.append((pairs[view, light], name))
+                else:
+                    pairs[view, light] = name
+        self.pairs = dict(sorted(pairs.items()))
+        self.views = sorted({view for view, _ in pairs})
+        self.lights = sorted({light for _, light in pairs})
+
+    def missing(self):
+        """The (view, light) in degrees that a product of these views and lights lacks."""
+        if len(self.pairs) == len(self.views) * len(self.lights):
+            return []
+        return [(v, n) for v in self.views for n in self.lights if (v, n) not in self.pairs]
+
+
+def _direction(angles, label):
+    """Angles in degrees, one way of writing each direction."""
+    theta, phi = angles
+    if not 0 <= theta <= 90:
+        raise InputError(
+            f"{label}: polar angle {theta:g} degrees; expected 0 to 90, a direction above the surface."
+        )
+    return (theta, round(phi % 360, 6) % 360 if theta > 0 else 0.0)
+
+
+def _settings(archive, name):
+    """Check the settings of a simulated set."""
+    label = archive.label(name)
+    try:
+        settings = json.loads(archive.read(name))
+    except ValueError as error:
+        raise InputError(f"{label}: not JSON ({error}).") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{label}: holds no mapping of settings.")
+    white, transfer = settings.get("white"), settings.get("transfer")
+    density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
+    for key, value in (("white", white), ("texels_per_mm", density)):
+        good = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e30
+        if value is not None and not good:
+            raise InputError(f"{label}: {key} is {value!r}; expected a positive number.")
+    if transfer is not None and transfer not in TRANSFERS:
+        raise InputError(
+            f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."
+        )
+    if toroidal is not None and not isinstance(toroidal, bool):
+        raise InputError(f"{label}: toroidal is {toroidal!r}; expected true or false.")
+    return settings
+
+
+@contextlib.contextmanager
+def open_measurement(path, *, pairs=False, frontal=False):
+    """Open a folder or zip in UBO2003's layout.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder or zip; see `Listing` for what is read.
+    pairs : bool
+        Accept pairs that are not a product of views and lights.
+    frontal : bool
+        Only the pair nearest the normal, of light and view.
+
+    Yields
+    ------
+    Measurement
+
+    Raises
+    ------
+    InputError
+        If there are no pictures, a pair is missing or there twice.
+    """
+    with open_archive(path) as archive, Decoder() as decoder:
+        listing = Listing(archive)
+        _require_whole(path, archive, listing, pairs or frontal)
+        chosen = listing.pairs
+        if frontal:
+            # least sum of squared angles; ties go to the first in order
+            pair = min(chosen, key=lambda pair: pair[0][0] ** 2 + pair[1][0] ** 2)
+            chosen = {pair: chosen[pair]}
+        views = sorted({view for view, _ in chosen})
+        lights = sorted({light for _, light in chosen})
+        view_at, light_at = ({a: i for i, a in enumerate(table)} for table in (views, lights))
+        members = list(chosen.values())
+        labels = [archive.label(name) for name in members]
+        mislabelled = []
+
+        def read(pair):
+            picture = decoder.decode(archive.read(members[pair]), labels[pair])
+            if is_mislabelled(PurePosixPath(members[pair]).name, picture.suffix):
+                mislabelled.append(members[pair])
+            return colours(picture, labels[pair])
+
+        def transfer(picture):
+            # Bonn states no response curve; users of its JPEGs invert gamma 2.2
+            jpeg = members[0].lower().endswith((".jpg", ".jpeg"))
+            display = "gamma2.2" if jpeg else "srgb"
+            return settings.get("transfer") or ("linear" if picture.dtype.kind == "f" else display)
+
+        settings = listing.settings
+        yield Measurement(
+            source=Path(path),
+            light_directions=from_angles(*np.radians(np.array(lights).T)),
+            view_directions=from_angles(*np.radians(np.array(views).T)),
+            light_index=np.array([light_at[light] for _, light in chosen], np.int32),
+            view_index=np.array([view_at[view] for view, _ in chosen], np.int32),
+            names=labels,
+            read=read,
+            transfer=transfer,
+            white=settings.get("white"),
+            toroidal=settings.get("toroidal"),
+            texels_per_mm=settings.get("texels_per_mm"),
+            facts={"format": "UBO2003", "strays": listing.strays, "mislabelled": mislabelled},
+        )
+
+
+def _require_whole(path, archive, listing, any_pairs):
+    """Refuse a listing with no pictures, a pair twice, or (unless `any_pairs`) a pair missing."""
+    if not listing.pairs:
+        seen = (
+            f"{len(listing.strays)} other files, first {listing.strays[0]}"
+            if listing.strays
+            else "none"
+        )
+        raise InputError(
+            f"{path}: holds no pictures with light and view angles in their names ({seen}); expected names such"
+            " as '00008 tl000 pl000 tv030 pv030.jpg'."
+        )
+    if listing.duplicates:
+        first, second = listing.duplicates[0]
+        raise InputError(
+            f"{path}: {len(listing.duplicates)} pairs are there twice (first: {first!r} and {second!r});"
+            " remove one of each."
+        )
+    missing = listing.missing()
+    if missing and not any_pairs:
+        (tv, pv), (tl, pl) = missing[0]
+        raise InputError(
+            f"{path}: {len(missing)} of {len(listing.views) * len(listing.lights)} view/light pairs are missing"
+            f" (first: tl{tl:g} pl{pl:g} tv{tv:g} pv{pv:g}). Add them, or pass --pairs to keep"
+            f" the {len(listing.pairs)} there are as a list of pairs."
+        )

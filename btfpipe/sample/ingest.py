@@ -1,0 +1,305 @@
+"""From a measurement to a Sample file, streaming: no more than a few pictures are in memory at a time."""
+
+import numpy as np
+
+from btfpipe import store
+from btfpipe.errors import InputError
+from btfpipe.parallel import blocks, ordered_map
+from btfpipe.sample.sample import Sample
+from btfpipe.sample.transfer import decode, decode_table, encode
+
+_BLOCK_BYTES = 2**22
+_FULL = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
+
+
+def ingest(
+    measurement,
+    path,
+    *,
+    crop=None,
+    size=None,
+    transfer=None,
+    white=None,
+    grey_card=None,
+    grey_card_reflectance=None,
+    flatten=False,
+    toroidal=None,
+    texels_per_mm=None,
+    threads=1,
+    report=lambda done, total: None,
+    about=None,
+):
+    """Read all pictures of a measurement and write them as a Sample.
+
+    Eight-bit pictures are stored as they are, with their transfer curve; others as linear floating point (16-bit floats
+    stay so), unclipped. Resized eight-bit pictures are rounded to eight bits again.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    path : path-like
+        Sample to write; it appears only when complete.
+    crop : (row, col, rows, cols), optional
+        Part of the pictures to keep.
+    size : (rows, cols), optional
+        Size of the result in texels; see `resize.Resizer`.
+    transfer : str, optional
+        Curve of the pictures, by default what the format means.
+    white : float, optional
+        Decoded value, 1 for the largest code, of a perfect white diffuser lit at normal incidence. It makes the
+        scale absolute.
+    grey_card : (row, col, rows, cols), optional
+        Part of the uncropped pictures that shows a diffuse card of known reflectance; measured in the pair nearest
+        the normal, in place of `white`.
+    grey_card_reflectance : float, optional
+        In (0, 1].
+    flatten : bool
+        Store a gain that removes slow drift of brightness over the patch; see `drift_gain`.
+    toroidal : bool, optional
+        By default what the source says, unless a crop breaks it.
+    texels_per_mm : float, optional
+        Of the source's pictures, before resizing.
+    threads : int
+        Never changes the result.
+    report : callable
+        ``report(done, total)`` after each block of pictures.
+    about : dict, optional
+        Further provenance for the file.
+
+    Returns
+    -------
+    dict
+        Facts for the summary: sizes, clipped pixels and so on.
+
+    Raises
+    ------
+    InputError
+        If a picture cannot be decoded, differs in size or kind, or holds values that are not finite; if a region lies
+        outside the pictures.
+    """
+    first = measurement.read(0)
+    shape = first.shape[:2]
+    _inside(crop, shape, "--crop", measurement)
+    _inside(grey_card, shape, "--grey-card", measurement)
+    row, col, rows, cols = crop or (0, 0, *shape)
+    texels = tuple(size or (rows, cols))
+    curve = transfer or measurement.transfer(first)
+    cropped = (rows, cols) != shape
+    if toroidal is None:
+        toroidal = bool(measurement.toroidal) and not cropped
+    if flatten and toroidal:
+        raise InputError(
+            f"{measurement.source}: a patch that repeats has no drift to remove; leave --flatten out or say"
+            " --not-toroidal."
+        )
+    white = _white(measurement, white, grey_card, grey_card_reflectance, curve)
+    eight_bit = first.dtype == np.uint8
+    dtype = first.dtype if first.dtype in (np.uint8, np.float16) else np.dtype(np.float32)
+    convert = _converter(first.dtype, dtype, curve, (rows, cols), texels, toroidal)
+    table = decode_table(np.uint8, curve) if eight_bit else None
+
+    def read_block(block):
+        pictures = np.empty((block.stop - block.start, *texels, 3), dtype)
+        clipped = clipped_pictures = 0
+        for slot, pair in enumerate(range(block.start, block.stop)):
+            picture = first if pair == 0 else measurement.read(pair)
+            _like_first(picture, first, pair, measurement)
+            picture = picture[row : row + rows, col : col + cols]
+            full = _FULL.get(picture.dtype)
+            if full and picture.max() == full:
+                clipped += int((picture == full).any(axis=2).sum())
+                clipped_pictures += 1
+            pictures[slot] = convert(picture)
+        total = None
+        if flatten:
+            total = np.zeros((*texels, 3))
+            for picture in pictures:
+                total += table[picture] if eight_bit else picture
+        return pictures, clipped, clipped_pictures, total
+
+    n_pairs = len(measurement.light_index)
+    sample = Sample(
+        np.broadcast_to(np.zeros(1, dtype), (n_pairs, *texels, 3)),
+        measurement.light_directions,
+        measurement.view_directions,
+        measurement.light_index,
+        measurement.view_index,
+        transfer=curve if eight_bit else "linear",
+        scale=1.0 if white is None else 1.0 / white,
+        toroidal=toroidal,
+        texels_per_mm=_density(measurement, texels_per_mm, (rows, cols), texels),
+        absolute=white is not None,
+    )
+    facts = {
+        "rows": texels[0],
+        "cols": texels[1],
+        "pairs": n_pairs,
+        "views": len(sample.view_directions),
+        "lights": len(sample.light_directions),
+        "product": sample.is_product,
+        "stored_as": str(dtype),
+        "source_transfer": curve,
+        "white": white,
+        "crop": list(crop) if crop else None,
+        "source_size": list(shape),
+        "clipped_pixels": 0,
+        "clipped_pictures": 0,
+    }
+    size_of_block = max(1, _BLOCK_BYTES // (rows * cols * 3 * first.itemsize))
+    with store.create(path, "sample", **(about or {}), **sample.facts()) as writer:
+        sample.write_tables(writer)
+        mean = np.zeros((*texels, 3))
+        done = 0
+        with writer.stream("pictures", sample.codes.shape, dtype) as put:
+            work = blocks(n_pairs, size_of_block)
+            for pictures, clipped, clipped_pictures, total in ordered_map(
+                read_block, work, threads
+            ):
+                put(pictures)
+                facts["clipped_pixels"] += clipped
+                facts["clipped_pictures"] += clipped_pictures
+                if flatten:
+                    mean += total
+                done += len(pictures)
+                report(done, n_pairs)
+        if flatten:
+            gain = drift_gain(mean / n_pairs)
+            writer.array("gain", gain)
+            facts["drift"] = float(gain.max() / gain.min() - 1)
+        writer.facts["source"] = facts | _plain_facts(measurement)
+    return facts
+
+
+def drift_gain(mean):
+    """Gain that removes slow drift of brightness from a patch.
+
+    The drift is the quadratic in row and column that fits the mean picture best: slow by construction, and free of the
+    border trouble of a blur. Its reciprocal keeps the patch's mean and, being grey, its colours.
+
+    Parameters
+    ----------
+    mean : (rows, cols, 3)
+        Linear mean over all lights and views.
+
+    Returns
+    -------
+    (rows, cols, 3) float32
+
+    Raises
+    ------
+    InputError
+        If the fit is not positive everywhere.
+    """
+    brightness = mean.mean(axis=2)
+    rows, cols = brightness.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
+    fit = np.linalg.lstsq(terms, brightness.ravel(), rcond=None)[0]
+    drift = (terms @ fit).reshape(rows, cols)
+    if drift.min() < 0.1 * drift.max():
+        raise InputError(
+            "--flatten: the mean picture falls to less than a tenth across the patch; that is no slow drift."
+            " Crop to the evenly lit part, or leave --flatten out."
+        )
+    gain = (drift.mean() / drift).astype(np.float32)
+    return np.repeat(gain[..., None], 3, axis=2)
+
+
+def _converter(source, dtype, curve, shape, texels, toroidal):
+    """A function from a cropped picture as read to one as stored."""
+    table = decode_table(np.uint8, curve) if source == np.uint8 else None
+
+    def linear(picture):
+        if table is not None:
+            return table[picture]
+        if source == np.uint16:
+            return decode(picture / 65535.0, curve).astype(np.float32)
+        return decode(picture, curve).astype(np.float32) if curve != "linear" else picture
+
+    if shape == texels:
+        return (lambda picture: picture) if source == np.uint8 else linear
+    from btfpipe.sample.resize import Resizer
+
+    resizer = Resizer(shape, texels, toroidal)
+
+    def convert(picture):
+        resized = resizer(linear(picture))
+        if dtype == np.uint8:
+            return (encode(resized, curve) * 255 + 0.5).astype(np.uint8)
+        return resized
+
+    return convert
+
+
+def _like_first(picture, first, pair, measurement):
+    """Refuse a picture of another size or kind than the first, or with values that are not finite."""
+    name = measurement.names[pair]
+    if picture.shape != first.shape:
+        raise InputError(
+            f"{name}: has {picture.shape[0]} x {picture.shape[1]} pixels; the first picture,"
+            f" {measurement.names[0]}, has {first.shape[0]} x {first.shape[1]}. All pictures of a set must agree."
+        )
+    if picture.dtype != first.dtype:
+        raise InputError(
+            f"{name}: holds {picture.dtype} values; the first picture, {measurement.names[0]}, holds"
+            f" {first.dtype}. All pictures of a set must agree."
+        )
+    if picture.dtype.kind == "f":
+        bad = picture.size - int(np.isfinite(picture).sum())
+        if bad:
+            raise InputError(
+                f"{name}: holds {bad} NaN or infinite values; mend or remove the picture."
+            )
+
+
+def _inside(region, shape, option, measurement):
+    if region is None:
+        return
+    row, col, rows, cols = region
+    if min(row, col) < 0 or min(rows, cols) < 1 or row + rows > shape[0] or col + cols > shape[1]:
+        raise InputError(
+            f"{option} {row} {col} {rows} {cols} does not lie inside the pictures of {measurement.source},"
+            f" which have {shape[0]} x {shape[1]} pixels."
+        )
+
+
+def _white(measurement, white, grey_card, reflectance, curve):
+    """Decoded value of a perfect white diffuser, or None if the scale is unknown."""
+    if grey_card is None:
+        return white if white is not None else measurement.white
+    light = measurement.light_directions[measurement.light_index][:, 2]
+    view = measurement.view_directions[measurement.view_index][:, 2]
+    pair = int(
+        np.argmin(np.arccos(np.clip(light, -1, 1)) ** 2 + np.arccos(np.clip(view, -1, 1)) ** 2)
+    )
+    row, col, rows, cols = grey_card
+    card = measurement.read(pair)[row : row + rows, col : col + cols]
+    full = _FULL.get(card.dtype)
+    if full and card.max() == full:
+        raise InputError(
+            f"{measurement.names[pair]}: the grey card is clipped; choose a region without {full}, or"
+            " give --white."
+        )
+    mean = float(decode(card / (full or 1), curve).mean())
+    if not mean > 0:
+        raise InputError(
+            f"{measurement.names[pair]}: the grey card's region has the mean {mean:g}."
+        )
+    return mean / (reflectance * float(light[pair]))
+
+
+def _density(measurement, texels_per_mm, shape, texels):
+    """Texels per millimetre after resizing; unknown if rows and columns are scaled differently."""
+    density = texels_per_mm or measurement.texels_per_mm
+    across, down = texels[1] / shape[1], texels[0] / shape[0]
+    if density is None or abs(across / down - 1) > 0.02:
+        return None
+    return density * across
+
+
+def _plain_facts(measurement):
+    """The reader's facts, lists sorted: threads may have filled them in any order."""
+    return {
+        key: sorted(value) if isinstance(value, list) else value
+        for key, value in measurement.facts.items()
+    }

@@ -1,0 +1,48 @@
+"""What a reader of a foreign format hands to `ingest`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass
+class Measurement:
+    """Pictures of one patch that are still to be read, with their directions.
+
+    Attributes
+    ----------
+    source : Path
+    light_directions, view_directions : (n, 3) float64
+        Unit vectors.
+    light_index, view_index : (pairs,) int32
+        A product has ``pair = view * lights + light``.
+    names : list of str
+        What messages call the picture of each pair.
+    read : callable
+        ``read(pair)`` gives a picture (rows, cols, 3) as stored: uint8, uint16, float16 or float32. Called from
+        several threads at once.
+    transfer : callable
+        ``transfer(picture)`` gives the transfer curve that the format means for a picture read.
+    white : float or None
+        Decoded value that stands for a perfect white diffuser lit at normal incidence.
+    toroidal : bool or None
+        None if the source does not say.
+    texels_per_mm : float or None
+    facts : dict
+        What else the reader found and the summary should say.
+    """
+
+    source: Path
+    light_directions: np.ndarray
+    view_directions: np.ndarray
+    light_index: np.ndarray
+    view_index: np.ndarray
+    names: list
+    read: Callable
+    transfer: Callable
+    white: float | None = None
+    toroidal: bool | None = None
+    texels_per_mm: float | None = None
+    facts: dict = field(default_factory=dict)
