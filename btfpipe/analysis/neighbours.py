@@ -59,8 +59,8 @@ def add_neighbour_lists(
     """Fill in the neighbour lists of every level, and say so in ``features.about``.
 
     Levels of up to `exhaustive_texels` texels are searched exhaustively. On a larger one the candidates of a texel are the four
-    children of each of the `seeds` nearest texels of its parent on the next coarser level (the paper's m = 100); below the
-    coarsest level a low-pass of its vectors serves as parent.
+    children of each of the `seeds` nearest texels of its parent on the next coarser level (the paper's m = 100; there,
+    all texels count, neighbourhoods being clamped at the border). Below the coarsest level a low-pass of its vectors serves as parent.
 
     Parameters
     ----------
@@ -87,30 +87,24 @@ def add_neighbour_lists(
     levels = list(features.levels)
     check_pyramid(levels[0].shape, len(levels), neighbourhood, coarse_neighbourhood)
     listed = len(levels)
-    while levels[-1].labels.size > exhaustive_texels and min(levels[-1].shape) >= 2 * neighbourhood:
-        if any(n % 2 for n in levels[-1].shape):
-            break
-        coarsest = levels[-1]
-        levels.append(plain_level(halve(coarsest.vectors[coarsest.labels], toroidal)))
-    below = None
+    while levels[-1].labels.size > exhaustive_texels:
+        levels.append(_low_pass(levels[-1], toroidal))
+    parents = None
     for i in reversed(range(len(levels))):
         level = levels[i]
         coarse = levels[i + 1] if i + 1 < listed else None
-        seeding = i > 0 and levels[i - 1].labels.size > exhaustive_texels
-        search = _Search(level, coarse, neighbourhood, coarse_neighbourhood, toroidal)
-        found = len(search)
-        if i < listed and found < k:
-            raise InputError(
-                f"level {i} has {found} texels whose neighbourhood of {neighbourhood} x {neighbourhood} lies inside"
-                f" the sample, fewer than k = {k}; lower k or the levels, or take a larger sample."
-            )
-        count = min(found, max(k, seeds) if seeding else k)
-        if below is None or level.labels.size <= exhaustive_texels:
-            below = search.exhaustive(count, threads)
-        else:
-            below = search.seeded(below[..., :seeds], count, threads)
+        sides = (neighbourhood, coarse_neighbourhood)
         if i < listed:
-            level.neighbours = np.ascontiguousarray(below[..., :k])
+            search = _Search(level, coarse, *sides, toroidal)
+            if len(search) < k:
+                raise InputError(
+                    f"level {i} has {len(search)} texels whose neighbourhood lies inside the sample, fewer than"
+                    f" k = {k}; lower k or the number of levels, or take a larger sample."
+                )
+            level.neighbours = search.lists(k, parents, threads)
+        if i > 0 and levels[i - 1].labels.size > exhaustive_texels:
+            search = _Search(level, coarse, *sides, toroidal, clamped=True)
+            parents = search.lists(min(seeds, len(search)), parents, threads)
     features.about |= {
         "neighbourhood": neighbourhood,
         "coarse_neighbourhood": coarse_neighbourhood,
@@ -147,16 +141,17 @@ def neighbourhood_distances(features, level, texels, others):
 class _Search:
     """What both searches need of a level and its coarser one."""
 
-    def __init__(self, level, coarse, side, coarse_side, toroidal):
+    def __init__(self, level, coarse, side, coarse_side, toroidal, clamped=False):
         self.rows, self.cols = level.shape
         coarse_rows, coarse_cols = coarse.shape if coarse else (0, 0)
         self.coarse_cols = coarse_cols
-        self.side = side
-        self.row_range = inside_range(self.rows, coarse_rows, side, coarse_side, toroidal)
-        self.col_range = inside_range(self.cols, coarse_cols, side, coarse_side, toroidal)
-        fine = _padded(level, side, toroidal)
+        everywhere = toroidal or clamped
+        self.row_range = inside_range(self.rows, coarse_rows, side, coarse_side, everywhere)
+        self.col_range = inside_range(self.cols, coarse_cols, side, coarse_side, everywhere)
+        mode = "wrap" if toroidal else "edge" if clamped else "constant"
+        fine = _padded(level, side, mode)
         if coarse:
-            self.tables = (*fine, side, *_padded(coarse, coarse_side, toroidal), coarse_side)
+            self.tables = (*fine, side, *_padded(coarse, coarse_side, mode), coarse_side)
         else:
             self.tables = (*fine, side, fine[0][:0], fine[1][:0, :0], fine[2][:0], 0)
 
@@ -164,6 +159,12 @@ class _Search:
         """How many texels lists may name."""
         spans = [max(0, high - low) for low, high in (self.row_range, self.col_range)]
         return spans[0] * spans[1]
+
+    def lists(self, k, parents, threads):
+        """Lists (rows, cols, k), from the children of `parents` (rows / 2, cols / 2, seeds) if given."""
+        if parents is None:
+            return self.exhaustive(k, threads)
+        return self.seeded(parents, k, threads)
 
     def exhaustive(self, k, threads):
         padded, table, vectors, side, coarse_padded, coarse_table, coarse_vectors, coarse_side = (
@@ -206,18 +207,23 @@ class _Search:
         return out
 
 
-def _padded(level, side, toroidal):
+def _low_pass(level, toroidal):
+    """A plain level of half the sides; odd sides are first made even by repeating the border."""
+    image = level.vectors[level.labels]
+    odd = [(0, n % 2) for n in level.shape]
+    return plain_level(halve(np.pad(image, (*odd, (0, 0)), "edge"), toroidal))
+
+
+def _padded(level, side, mode):
     """Labels with half a neighbourhood around them, the distance table, and the vectors.
 
-    Outside a sample that is not toroidal the label is the default's, whose distance to everything is set to 0:
-    such places do not count. The table is empty where it would not pay (plain features of a large sample).
+    In mode ``constant`` the label outside is the default's, whose distance to everything is set to 0: such
+    places do not count. The table is empty where it would not pay (plain features of a large sample).
     """
     margin = side // 2
     default = len(level.vectors) - 1
-    if toroidal:
-        padded = np.pad(level.labels, margin, "wrap")
-    else:
-        padded = np.pad(level.labels, margin, constant_values=default)
+    outside = {"constant_values": default} if mode == "constant" else {}
+    padded = np.pad(level.labels, margin, mode, **outside)
     if level.gram is not None:
         gram = np.asarray(level.gram, np.float64)
         square = np.diagonal(gram)
