@@ -213,8 +213,8 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
         Of JPEG, 1 to 100; chroma is not subsampled.
     names : list of str, optional
         Channel names, for EXR layers.
-    half : bool
-        Store 16-bit floats where the format can.
+    half : bool or list of bool
+        Store 16-bit floats where the format can; a list says so channel by channel (EXR).
     """
     import OpenImageIO as oiio
 
@@ -229,7 +229,10 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
     }
     kind = kinds[str(picture.dtype)]
     rows, cols, channels = picture.shape
-    spec = oiio.ImageSpec(cols, rows, channels, oiio.HALF if half else kind)
+    each = isinstance(half, list)
+    spec = oiio.ImageSpec(cols, rows, channels, kind if each or not half else oiio.HALF)
+    if each:
+        spec.channelformats = tuple(oiio.TypeHalf if h else oiio.TypeFloat for h in half)
     if names:
         spec.channelnames = tuple(names)
     if suffix in (".jpg", ".jpeg"):
