@@ -1,0 +1,79 @@
+"""``btfpipe render``: a picture of a scene."""
+
+from pathlib import Path
+
+import click
+
+from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.errors import InputError
+
+
+def _bindings(context, parameter, values):
+    found = {}
+    for value in values:
+        name, equals, file = value.partition("=")
+        if not equals or not name or not file:
+            raise click.BadParameter(f"{value!r}; write NAME=PATH.")
+        found[name.removeprefix("$")] = file
+    return found
+
+
+@click.command()
+@click.argument("scene", type=input_file(dir_okay=False))
+@click.option(
+    "--bind",
+    "bindings",
+    metavar="NAME=PATH",
+    multiple=True,
+    callback=_bindings,
+    help="File for the placeholder $NAME of the scene; may be given several times.",
+)
+@click.option("--width", type=click.IntRange(1), help="Pixels across, instead of the scene's.")
+@click.option("--height", type=click.IntRange(1), help="Pixels down, instead of the scene's.")
+@click.option("--samples", type=click.IntRange(1), help="Rays a pixel, instead of the scene's.")
+@click.option(
+    "--float",
+    "full",
+    is_flag=True,
+    help="Store all layers as 32-bit floats; colours, alpha and normals are 16-bit otherwise.",
+)
+@stage()
+def render(scene, bindings, width, height, samples, full, out, seed, threads, quiet):
+    """Make a picture of a scene: dressed surfaces under lights, as OpenEXR.
+
+    SCENE is a YAML file with camera, film, lights and objects. Layers of the picture: colour and alpha (R G B A,
+    linear Rec. 709), depth (Z), shading normal (N.X N.Y N.Z) and the sample's coordinates (texel.row texel.col).
+
+    \b
+    Example:
+      btfpipe render bunny.yaml -o bunny.exr
+      btfpipe render turntable.yaml --bind model=wool.model.npz --bind map=wool.map.npz -o wool.exr
+    """
+    import time
+
+    from btfpipe.formats.images import write_picture
+    from btfpipe.rendering.renderer import LAYERS
+    from btfpipe.rendering.renderer import render as render_scene
+    from btfpipe.rendering.scene import load_scene
+
+    if Path(out).suffix.lower() != ".exr":
+        raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
+    film = {"width": width, "height": height, "samples": samples}
+    start = time.perf_counter()
+    loaded = load_scene(scene, bindings, film=film)
+    load_seconds = time.perf_counter() - start
+    start = time.perf_counter()
+    with progress("render", quiet) as report:
+        picture = render_scene(loaded, seed=seed, threads=threads, on_progress=report)
+    render_seconds = time.perf_counter() - start
+    half = [not full and name[0] in "RGBAN" for name in LAYERS]
+    write_picture(out, picture, names=list(LAYERS), half=half)
+    return {
+        "inputs": [scene, *loaded.files],
+        "width": loaded.film.width,
+        "height": loaded.film.height,
+        "samples": loaded.film.samples,
+        "load_seconds": round(load_seconds, 3),
+        "render_seconds": round(render_seconds, 3),
+        "covered": float((picture[..., 3] > 0).mean()),
+    }

@@ -1,0 +1,110 @@
+"""Reading the scene's YAML: a closed schema, errors that name the key, files filled in."""
+
+from importlib import resources
+from pathlib import Path
+
+from btfpipe.errors import InputError
+
+
+def read_description(path, bindings=None):
+    """Read and check a scene's description.
+
+    Parameters
+    ----------
+    path : path-like
+        YAML; the schema beside this module says what it may hold.
+    bindings : dict, optional
+        Values of placeholders: ``$name`` where the description names a file.
+
+    Returns
+    -------
+    dict
+        As written, its file names replaced by `Path` objects.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a key is unknown, missing or has an unusable value, there is no light, a
+        placeholder has no binding, or a file does not exist.
+    """
+    import jsonschema
+    import yaml
+
+    path = Path(path)
+    try:
+        scene = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}).") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML ({' '.join(str(error).split())}).") from error
+    schema = yaml.safe_load(
+        resources.files("btfpipe.rendering").joinpath("scene.schema.yaml").read_text("utf-8")
+    )
+    errors = list(jsonschema.Draft202012Validator(schema).iter_errors(scene))
+    if errors:
+        raise InputError(f"{path}: {_explain(errors[0])}")
+    if not scene["lights"]:
+        raise InputError(f"{path}: lights is empty; a scene needs at least one light.")
+    unused = set(bindings or {})
+    for number, thing in enumerate(scene["objects"]):
+        for key in ("surface", "map", "model", "mesh"):
+            if key in thing:
+                unused.discard(thing[key].removeprefix("$"))
+                thing[key] = _file(path, f"objects[{number}].{key}", thing[key], bindings or {})
+    if unused:
+        raise InputError(f"{path}: no file is named ${sorted(unused)[0]}, which --bind gives.")
+    return scene
+
+
+def _file(scene, where, value, bindings):
+    """The file that a value names."""
+    if value.startswith("$"):
+        if value[1:] not in bindings:
+            raise InputError(f"{scene}: {where} is {value}; give it with --bind {value[1:]}=FILE.")
+        file = Path(bindings[value[1:]])
+    else:
+        file = scene.parent / value
+    if not file.is_file():
+        raise InputError(f"{scene}: {where} is {file}, and there is no such file.")
+    return file
+
+
+def _explain(error, prefix=()):
+    """One sentence on a schema error: where, what was found, what was expected."""
+    path = [*prefix, *error.path] if not prefix else list(prefix)
+    if error.validator == "oneOf" and error.context:
+        return _explain(_closest(error), [*path, *_closest(error).path])
+    where = _where(path)
+    known = ", ".join(error.schema.get("properties", ()))
+    if error.validator == "additionalProperties":
+        key = next(k for k in error.instance if k not in error.schema["properties"])
+        return f"unknown key {key!r} in {where}; expected {known}."
+    if error.validator == "required":
+        missing = next(k for k in error.validator_value if k not in error.instance)
+        return f"key {missing!r} is missing in {where}."
+    return f"{where}: {error.message}."
+
+
+def _closest(error):
+    """The first error of the alternative that the writer most likely meant."""
+    branches = {}
+    for inner in error.context:
+        branches.setdefault(inner.schema_path[0], []).append(inner)
+
+    def misfit(branch):
+        wrong_kind = sum(e.validator in ("required", "const") for e in branch)
+        strange = 0
+        for e in branch:
+            if e.validator == "additionalProperties":
+                strange += sum(k not in e.schema["properties"] for k in e.instance)
+        return (wrong_kind + strange, len(branch))
+
+    return min(branches.values(), key=misfit)[0]
+
+
+def _where(path):
+    """``objects[1].plane`` of a path of keys and indices."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text or "the scene"

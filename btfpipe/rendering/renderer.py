@@ -1,0 +1,181 @@
+"""Rays through tiles: Embree finds what they hit, kernels shade it."""
+
+import numpy as np
+
+from btfpipe.parallel import ordered_map
+from btfpipe.rendering import kernels
+from btfpipe.rendering.camera import filter_table, strata
+
+LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
+_RAYS = (
+    1 << 16
+)  # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
+
+
+class Renderer:
+    """Holds what all tiles share: the ray tree, the merged mesh and the objects' places in it.
+
+    Parameters
+    ----------
+    scene : Scene
+    seed : int
+        Of the rays' places inside their strata.
+    """
+
+    def __init__(self, scene, seed=0):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.scene = scene
+        self.seed = seed
+        self.vertices = np.concatenate([t.vertices for t in scene.objects])
+        self.normals = np.concatenate([t.normals for t in scene.objects])
+        first_vertex = np.cumsum([0] + [len(t.vertices) for t in scene.objects])
+        self.first_face = np.cumsum([0] + [len(t.faces) for t in scene.objects])
+        self.faces = np.concatenate(
+            [t.faces + n for t, n in zip(scene.objects, first_vertex, strict=False)]
+        ).astype(np.int32)
+        self.table = filter_table(scene.film.filter, scene.film.radius)
+        # single precision positions are this far off at the scene's size
+        self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
+        self.tree = EmbreeScene(robust=True)
+        self._mesh = TriangleMesh(self.tree, self.vertices.astype(np.float32), self.faces)
+        ray = np.zeros((1, 3), np.float32)
+        self.tree.run(ray, ray + 1)  # builds the tree before threads ask for it
+
+    def tiles(self):
+        """Rectangles (x, y, width, height) that cover the film."""
+        film = self.scene.film
+        side = min(max(int(np.sqrt(_RAYS / film.samples)), 8), 256)
+        return [
+            (x, y, min(side, film.width - x), min(side, film.height - y))
+            for y in range(0, film.height, side)
+            for x in range(0, film.width, side)
+        ]
+
+    def tile(self, rectangle):
+        """Layers (height, width, 10) float32 of a rectangle of pixels."""
+        x, y, width, height = rectangle
+        film, camera = self.scene.film, self.scene.camera
+        n = width * height * film.samples
+        origins, directions = np.empty((n, 3)), np.empty((n, 3))
+        kernels.camera_rays(
+            x, y, width, height, film.width, film.height, *strata(film.samples), self.table,
+            self.seed, camera.position, camera.axes, np.array(camera.extent), camera.perspective,
+            origins, directions,
+        )  # fmt: skip
+        found = self.tree.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+        hits = np.flatnonzero(found["primID"] >= 0)
+        points = Points(self, hits, found["primID"], origins, directions)
+        radiance = np.zeros((len(hits), 3))
+        if len(hits):
+            for light in self.scene.lights:
+                self._add_light(light, points, radiance)
+        picture = np.empty((width * height, len(LAYERS)))
+        # depth along the camera's axis, as compositing programs expect it
+        depth = points.depth * (directions[hits] @ camera.axes[2])
+        kernels.resolve(
+            hits, film.samples, radiance, depth, points.normal, points.texels(), picture
+        )
+        if self.scene.background is not None:
+            picture[:, :3] += (1 - picture[:, 3:4]) * self.scene.background
+            picture[:, 3] = 1
+        return picture.reshape(height, width, -1).astype(np.float32)
+
+    def _add_light(self, light, points, radiance):
+        """Add one light's share to the radiance of all points."""
+        n = len(points.hits)
+        w_i, irradiance = np.empty((n, 3)), np.empty((n, 3))
+        far, lit = np.empty(n), np.empty(n, np.int64)
+        count = kernels.light_rays(
+            light.directional, light.place, light.power, points.start, points.point,
+            points.normal, w_i, irradiance, far, lit,
+        )  # fmt: skip
+        lit = lit[:count]
+        blocked = self.tree.run(
+            points.start[lit].astype(np.float32),
+            w_i[lit].astype(np.float32),
+            dists=far[lit].astype(np.float32),
+            query="OCCLUDED",
+        )
+        lit = lit[blocked < 0]
+        for number, thing in enumerate(self.scene.objects):
+            mine = lit[points.thing[lit] == number]
+            if thing.dressing is None:
+                kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
+            elif len(mine):
+                self._add_dressed(thing, mine, points, w_i, irradiance, radiance)
+
+    def _add_dressed(self, thing, lit, points, w_i, irradiance, radiance):
+        dress = thing.dressing
+        n = kernels.count_lookups(lit, points.face, dress.weight, dress.coherent)
+        row, col, blend = (np.empty(n, np.float32) for _ in range(3))
+        at_i, at_o, values = (np.empty((n, 3), np.float32) for _ in range(3))
+        target = np.empty(n, np.int64)
+        n = kernels.gather_lookups(
+            lit, points.face, points.share, points.normal, points.facing, points.toward_eye, w_i,
+            thing.faces, dress.row, dress.col, dress.weight, dress.axis, dress.coherent,
+            dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target,
+        )  # fmt: skip
+        dress.shader.shade(row[:n], col[:n], at_i[:n], at_o[:n], values[:n])
+        kernels.add_lookups(values[:n], blend, target, irradiance, radiance)
+
+
+class Points:
+    """The hits of a tile's rays; see `kernels.surface_points` for the arrays."""
+
+    def __init__(self, renderer, hits, prim, origins, directions):
+        n = len(hits)
+        self.renderer = renderer
+        self.hits = hits
+        self.share, self.point, self.start, self.normal = (np.empty((n, 3)) for _ in range(4))
+        self.facing, self.depth = np.empty(n), np.empty(n)
+        kernels.surface_points(
+            hits, prim, origins, directions, renderer.vertices, renderer.faces, renderer.normals,
+            renderer.smallest, self.share, self.point, self.start, self.normal, self.facing,
+            self.depth,
+        )  # fmt: skip
+        self.toward_eye = -directions[hits]
+        self.thing = np.searchsorted(renderer.first_face, prim[hits], side="right") - 1
+        self.face = prim[hits] - renderer.first_face[self.thing]
+
+    def texels(self):
+        """Sample coordinates (n, 2) of all points, -1 where there are none."""
+        texel = np.full((len(self.hits), 2), -1.0)
+        for number, thing in enumerate(self.renderer.scene.objects):
+            d = thing.dressing
+            if d is not None:
+                kernels.texel_coordinates(
+                    np.flatnonzero(self.thing == number), self.face, self.share, thing.faces, d.row,
+                    d.col, d.weight, d.coherent, d.rows, d.cols, d.toroidal, texel,
+                )  # fmt: skip
+        return texel
+
+
+def render(scene, *, seed=0, threads=1, on_progress=None):
+    """Render a Scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    seed : int
+    threads : int
+        Never changes the result.
+    on_progress : callable, optional
+        Called with (tiles done, tiles).
+
+    Returns
+    -------
+    (height, width, 10) float32
+        The layers named by `LAYERS`: linear radiance with alpha (coverage) multiplied in, depth along the camera's
+        axis (0 where nothing is hit), unit shading normal, and sample coordinates (-1 where there are none).
+    """
+    renderer = Renderer(scene, seed)
+    tiles = renderer.tiles()
+    picture = np.empty((scene.film.height, scene.film.width, len(LAYERS)), np.float32)
+    done = zip(tiles, ordered_map(renderer.tile, tiles, threads), strict=True)
+    for number, ((x, y, width, height), pixels) in enumerate(done):
+        picture[y : y + height, x : x + width] = pixels
+        if on_progress:
+            on_progress(number + 1, len(tiles))
+    return picture

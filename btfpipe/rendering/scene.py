@@ -1,0 +1,206 @@
+"""The Scene: camera, film, lights and objects, loaded and checked against each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfpipe.compression import open_appearance
+from btfpipe.errors import InputError
+from btfpipe.rendering import objects
+from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
+from btfpipe.rendering.description import read_description
+
+
+@dataclass
+class Film:
+    """Pixels across and down, rays a pixel, and the filter that gathers them (radius in pixels)."""
+
+    width: int = 512
+    height: int = 512
+    samples: int = 16
+    filter: str = "gaussian"
+    radius: float = 1.5
+
+
+@dataclass
+class Light:
+    """A directional light (`place` is the direction towards it, `power` its irradiance) or a point light (its
+    position, its intensity)."""
+
+    directional: bool
+    place: np.ndarray
+    power: np.ndarray
+
+
+@dataclass
+class Scene:
+    """All that a picture is made of.
+
+    Attributes
+    ----------
+    camera : Camera
+    film : Film
+    lights : list of Light
+    objects : list of Thing
+    background : (3,) float64 or None
+        Radiance where nothing is hit; None is transparent black.
+    files : list of Path
+        What the scene was loaded from, without the description itself.
+    """
+
+    camera: Camera
+    film: Film
+    lights: list
+    objects: list
+    background: np.ndarray | None = None
+    files: list | None = None
+
+
+def load_scene(path, bindings=None, *, film=None, read_mesh=None):
+    """Load a scene's description and all files that it names.
+
+    Parameters
+    ----------
+    path : path-like
+        YAML; see `read_description`.
+    bindings : dict, optional
+        Files for its placeholders.
+    film : dict, optional
+        Replaces entries of its film.
+    read_mesh : callable, optional
+        Path to (vertices, faces) of a foreign mesh file.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        As `read_description`; if files do not belong together; if the camera is inside an object.
+    """
+    description = read_description(path, bindings)
+    settings = description.get("film", {}) | {k: v for k, v in (film or {}).items() if v}
+    settings.setdefault("filter", "gaussian")
+    settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
+    film = Film(**settings)
+    try:
+        lights = [_light(i, light) for i, light in enumerate(description["lights"])]
+        opened, things, grounds, files = {}, [], [], []
+        for number, entry in enumerate(description["objects"]):
+            files += [entry[key] for key in ("surface", "map", "model", "mesh") if key in entry]
+            if "ground" in entry:
+                grounds.append(entry)
+                continue
+            try:
+                thing = _thing(entry, opened, read_mesh)
+                things.append(objects.transformed(thing, entry.get("transform")))
+            except InputError as error:
+                raise InputError(f"objects[{number}]: {error}") from error
+        dressed = [t for t in things if t.dressing is not None] or things
+        if not dressed:
+            raise InputError("objects: a ground needs something to lie below; add an object.")
+        points = np.concatenate([t.vertices for t in dressed])
+        camera = make_camera(description["camera"], film.width / film.height, points)
+        for number, thing in enumerate(things):
+            if thing.solid and _inside(thing, camera.position):
+                raise InputError(
+                    f"camera: position {_numbers(camera.position)} is inside objects[{number}]; move it out, or"
+                    " give direction instead of position for automatic framing."
+                )
+        up = np.array(description["camera"].get("up", [0, 1, 0]), float)
+        things += [_ground(entry, points, up) for entry in grounds]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    background = description.get("background")
+    return Scene(
+        camera, film, lights, things,
+        None if background is None else np.array(background, float),
+        list(dict.fromkeys(files)),
+    )  # fmt: skip
+
+
+def _light(number, light):
+    if light["type"] == "point":
+        return Light(False, np.array(light["position"], float), np.array(light["intensity"], float))
+    direction = np.array(light["direction"], float)
+    length = np.linalg.norm(direction)
+    if length < 1e-12:
+        raise InputError(f"lights[{number}]: direction is zero; it points towards the light.")
+    return Light(True, direction / length, np.array(light["irradiance"], float))
+
+
+def _thing(entry, opened, read_mesh):
+    """Load one object; Models, Surfaces and their shaders are opened once."""
+    from btfpipe.surface import Surface
+    from btfpipe.synthesis import CoordinateMap
+
+    def open_once(opener, file):
+        key = (opener, file)
+        if key not in opened:
+            opened[key] = opener(file)
+        return opened[key]
+
+    interpolation = entry.get("interpolation", "barycentric")
+    if "surface" in entry:
+        surface = open_once(Surface.open, entry["surface"])
+        coordinates = open_once(CoordinateMap.open, entry["map"])
+        belongs = coordinates.domain.get("surface")
+        if belongs is None:
+            raise InputError(f"{entry['map']}: a map over a plane; this object is a surface.")
+        if belongs != surface.digest:
+            raise InputError(
+                f"{entry['map']}: made for surface {belongs}; {entry['surface']} is {surface.digest}. Run"
+                " `btfpipe synthesize` on this surface, or name the other."
+            )
+        appearance = open_once(open_appearance, entry["model"])
+        return objects.dressed_surface(
+            surface.levels[0], coordinates, appearance, interpolation, entry["map"]
+        )
+    if "plane" in entry and "model" in entry:
+        coordinates = None
+        if "map" in entry:
+            coordinates = open_once(CoordinateMap.open, entry["map"])
+            if "plane" not in coordinates.domain:
+                raise InputError(f"{entry['map']}: a map over a surface; this object is a plane.")
+        return objects.patch(
+            entry["plane"],
+            open_once(open_appearance, entry["model"]),
+            interpolation,
+            coordinates=coordinates,
+            texels_per_unit=entry.get("texels_per_unit"),
+            repeats=entry.get("repeats"),
+        )
+    if "plane" in entry:
+        return objects.flat(entry["plane"], entry["albedo"])
+    return objects.diffuse_mesh(entry["mesh"], entry["albedo"], read_mesh)
+
+
+def _ground(entry, points, up):
+    """A diffuse square below all points, across `up`."""
+    up = up / np.linalg.norm(up)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, diagonal = (low + high) / 2, np.linalg.norm(high - low)
+    settings = entry["ground"] or {}
+    bottom = (points @ up).min() - settings.get("gap", 0)
+    side = np.cross(up, [1, 0, 0] if abs(up[0]) < 0.9 else [0, 1, 0])
+    size = settings.get("size", 40) * diagonal
+    plane = {
+        "center": middle + (bottom - middle @ up) * up,
+        "s": side,
+        "t": np.cross(up, side),
+        "size": [size, size],
+    }
+    return objects.flat(plane, entry["albedo"])
+
+
+def _inside(thing, position):
+    if not (
+        (position > thing.vertices.min(axis=0)) & (position < thing.vertices.max(axis=0))
+    ).all():
+        return False
+    return abs(objects.winding_number(thing.vertices, thing.faces, *position)) > 0.5
+
+
+def _numbers(vector):
+    return "[" + ", ".join(f"{x:.4g}" for x in vector) + "]"
