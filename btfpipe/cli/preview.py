@@ -1,0 +1,47 @@
+"""``btfpipe preview``: pictures for people."""
+
+from pathlib import Path
+
+import click
+
+from btfpipe.cli.options import input_file, stage
+from btfpipe.errors import InputError
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=input_file(dir_okay=False))
+@click.option("--columns", type=click.IntRange(1), help="Pictures across the sheet.", show_default="square")
+@click.option("--exposure", type=float, metavar="EV", show_default="automatic",
+              help="Brighten by this many doublings, the same for all pictures.")
+@click.option("--filmic", is_flag=True, help="Bend highlights to white instead of clipping them.")
+@click.option("--layer", type=click.Choice(["colour", "alpha", "depth", "normal", "texel"]), default="colour",
+              show_default=True, help="Layer of rendered pictures to show.")
+@click.option("--labels", is_flag=True, help="Write file names, or directions in degrees, below the pictures.")
+@stage()
+def preview(files, columns, exposure, filmic, layer, labels, out):
+    """Tone-map rendered pictures into one PNG, or show a Sample or Model under many lights and views.
+
+    Several pictures make a contact sheet with one exposure for all; of a Sample or Model the sheet has views
+    down and lights across.
+
+    \b
+    Example:
+      btfpipe preview bunny.exr -o bunny.png
+      btfpipe preview dressed.exr textured.exr --columns 2 -o both.png
+      btfpipe preview wool.model.npz --labels -o wool.png
+    """
+    from btfpipe.formats.images import write_picture
+    from btfpipe.rendering.preview import preview as make_preview
+
+    if Path(out).suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"{out}: previews are PNG or JPEG; end the name in .png or .jpg.")
+    picture, stops = make_preview(
+        files, columns=columns, exposure=exposure, filmic=filmic, layer=layer, labels=labels
+    )
+    write_picture(out, picture)
+    return {
+        "inputs": list(files),
+        "width": picture.shape[1],
+        "height": picture.shape[0],
+        "exposure": stops,
+    }

@@ -1,0 +1,271 @@
+"""Pictures for people: tone mapping and contact sheets."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from btfpipe.errors import InputError
+from btfpipe.sample.transfer import encode
+
+GAP = 4  # pixels between the pictures of a sheet
+BACKDROP = 0.18  # display value behind transparent pictures and between them
+LAYERS = ("colour", "alpha", "depth", "normal", "texel")
+
+
+def auto_exposure(pictures, percentile=99.0):
+    """Factor that brings the given percentile of all covered pixels' brightness to 0.8.
+
+    Parameters
+    ----------
+    pictures : list of (rows, cols, 3 or 4) arrays
+        Linear; the fourth channel is coverage.
+    percentile : float
+    """
+    bright = []
+    for picture in pictures:
+        values = picture[..., :3].max(axis=-1)
+        if picture.shape[2] > 3:
+            values = values[picture[..., 3] > 0.5]
+        bright.append(values.ravel())
+    bright = np.concatenate(bright)
+    top = float(np.percentile(bright, percentile)) if bright.size else 0.0
+    return 0.8 / top if top > 0 else 1.0
+
+
+def tone_map(picture, exposure=1.0, filmic=False):
+    """Display values (rows, cols, 3) uint8 of a linear picture, alpha laid over the backdrop.
+
+    Parameters
+    ----------
+    picture : (rows, cols, 3 or 4) array
+        Linear Rec. 709, alpha multiplied in.
+    exposure : float
+        Factor before the curve.
+    filmic : bool
+        Bend highlights to white (Narkowicz's fit of the ACES curve) instead of clipping them.
+    """
+    colour = np.maximum(np.asarray(picture[..., :3], np.float32) * np.float32(exposure), 0)
+    if filmic:
+        colour = colour * (2.51 * colour + 0.03) / (colour * (2.43 * colour + 0.59) + 0.14)
+    if picture.shape[2] > 3:
+        behind = np.float32(((BACKDROP + 0.055) / 1.055) ** 2.4)
+        colour = colour + (1 - np.clip(picture[..., 3:4], 0, 1)) * behind
+    return np.clip(encode(np.clip(colour, 0, 1), "srgb") * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+def show_layer(channels, layer, name):
+    """Display picture (rows, cols, 3) uint8 of another layer than colour.
+
+    Parameters
+    ----------
+    channels : dict
+        Channel name to (rows, cols) array.
+    layer : str
+        ``alpha``, ``depth`` (near is white), ``normal`` (components from -1 to 1) or ``texel`` (columns red, rows
+        green, each from 0 to the picture's largest).
+    name : str
+        What messages call the picture.
+    """
+    needs = {
+        "alpha": ("A",),
+        "depth": ("Z",),
+        "normal": ("N.X", "N.Y", "N.Z"),
+        "texel": ("texel.col", "texel.row"),
+    }[layer]
+    missing = [c for c in needs if c not in channels]
+    if missing:
+        raise InputError(
+            f"{name}: has no channel {missing[0]!r}, which the layer {layer} needs; it has"
+            f" {', '.join(channels)}."
+        )
+    planes = np.stack([np.asarray(channels[c], np.float32) for c in needs], axis=-1)
+    if layer == "alpha":
+        shown = np.repeat(planes, 3, axis=-1)
+    elif layer == "depth":
+        hit = planes > 0
+        if hit.any():
+            near, far = planes[hit].min(), planes[hit].max()
+            shown = np.where(hit, 1 - 0.9 * (planes - near) / max(far - near, 1e-12), 0)
+        else:
+            shown = np.zeros_like(planes)
+        shown = np.repeat(shown, 3, axis=-1)
+    elif layer == "normal":
+        shown = np.where((planes != 0).any(axis=-1, keepdims=True), planes / 2 + 0.5, 0)
+    else:
+        top = np.maximum(planes.max(axis=(0, 1)), 1e-12)
+        shown = np.where(planes >= 0, planes / top, 0)
+        shown = np.concatenate([shown, np.zeros_like(shown[..., :1])], axis=-1)
+    return np.clip(shown * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+def read_channels(path):
+    """Channels of a rendered picture, name to (rows, cols) array."""
+    from btfpipe.formats.images import open_picture
+
+    picture = open_picture(path)
+    return {c: picture.values[..., i] for i, c in enumerate(picture.channels)}
+
+
+def colour_of(channels, name):
+    """Colour, with alpha where there is one, (rows, cols, 3 or 4) float32."""
+    missing = [c for c in "RGB" if c not in channels]
+    if missing:
+        raise InputError(
+            f"{name}: has no channel {missing[0]!r}; it has {', '.join(channels)}. Expected a rendered picture."
+        )
+    wanted = [*"RGB", *(["A"] if "A" in channels else [])]
+    return np.stack([np.asarray(channels[c], np.float32) for c in wanted], axis=-1)
+
+
+def sheet(pictures, columns=None, labels=None):
+    """Lay display pictures out in rows.
+
+    Parameters
+    ----------
+    pictures : list of (rows, cols, 3) uint8
+        May differ in size; each is centred in a cell of the largest.
+    columns : int, optional
+        As square a sheet as possible by default.
+    labels : list of str, optional
+        Written under the pictures.
+    """
+    columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    height = max(p.shape[0] for p in pictures)
+    width = max(p.shape[1] for p in pictures)
+    scale = max(1, round(width / 400))
+    text = 12 * scale if labels else 0
+    gap = GAP if len(pictures) > 1 else 0
+    out = np.full(
+        (rows * (height + text + gap) - gap, columns * (width + gap) - gap, 3),
+        round(BACKDROP * 255),
+        np.uint8,
+    )
+    for number, picture in enumerate(pictures):
+        y = number // columns * (height + text + gap)
+        x = number % columns * (width + gap)
+        top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+        out[y + top : y + top + picture.shape[0], x + left : x + left + picture.shape[1]] = picture
+        if labels:
+            strip = out[y + height : y + height + text, x : x + width]
+            strip[:] = _write(labels[number], strip, scale)
+    return out
+
+
+def _write(label, strip, scale):
+    """The strip with a label on it, through OpenImageIO's text (it needs a font; without one, no label)."""
+    import OpenImageIO as oiio
+
+    buffer = oiio.ImageBuf(np.ascontiguousarray(strip))
+    drawn = oiio.ImageBufAlgo.render_text(
+        buffer, 3 * scale, 9 * scale, label, 9 * scale, "", (0.9, 0.9, 0.9)
+    )
+    if not drawn:
+        oiio.geterror()
+        return strip
+    return buffer.get_pixels(oiio.UINT8)
+
+
+def sample_sheet(appearance, lights=6, views=6):
+    """Linear pictures of evenly chosen pairs, views down and lights across.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    lights, views : int
+        At most this many of each.
+
+    Returns
+    -------
+    pictures : list of (rows, cols, 3) float32
+    labels : list of str
+    columns : int
+    """
+    from btfpipe.directions import to_angles
+
+    light = _spread(appearance.light_directions, lights)
+    view = _spread(appearance.view_directions, views)
+    pair_of = {
+        (int(v), int(i)): n
+        for n, (v, i) in enumerate(
+            zip(appearance.view_index, appearance.light_index, strict=True)
+        )
+    }
+    pictures, labels = [], []
+    for v in view:
+        for i in light:
+            angles = [
+                np.degrees(to_angles(d))
+                for d in (appearance.light_directions[i], appearance.view_directions[v])
+            ]
+            labels.append("light {:.0f} {:.0f}  view {:.0f} {:.0f}".format(*np.concatenate(angles)))
+            if (v, i) in pair_of:
+                pictures.append(np.asarray(appearance.pictures([pair_of[v, i]])[0]))
+            else:
+                pictures.append(np.zeros((*appearance.shape, 3), np.float32))
+    return pictures, labels, len(light)
+
+
+def _spread(directions, count):
+    """Indices of directions far from each other, the most frontal first, in the order of the set."""
+    chosen = [int(np.argmax(directions[:, 2]))]
+    while len(chosen) < min(count, len(directions)):
+        distance = np.linalg.norm(directions[:, None] - directions[chosen], axis=2).min(axis=1)
+        chosen.append(int(distance.argmax()))
+    return sorted(chosen)
+
+
+def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False):
+    """Display picture (rows, cols, 3) uint8 of rendered pictures, or of one Sample or Model.
+
+    Parameters
+    ----------
+    paths : list of path-like
+    columns : int, optional
+    exposure : float, optional
+        Stops (doublings); by default one exposure that suits the whole sheet.
+    filmic : bool
+    layer : str
+        One of `LAYERS`.
+    labels : bool
+        Write names, or directions in degrees, below the pictures.
+
+    Returns
+    -------
+    (rows, cols, 3) uint8
+    float
+        The exposure used, in stops.
+
+    Raises
+    ------
+    InputError
+        If a file is neither a picture nor a Sample or Model, or lacks the layer.
+    """
+    import zipfile
+
+    paths = [Path(p) for p in paths]
+    archives = [p for p in paths if zipfile.is_zipfile(p)]
+    if archives:
+        from btfpipe.compression import open_appearance
+
+        if len(paths) > 1:
+            raise InputError(
+                f"{archives[0]}: a sheet shows several pictures or one Sample or Model; give it alone."
+            )
+        if layer != "colour":
+            raise InputError(f"{paths[0]}: a Sample or Model has no layer {layer}.")
+        linear, names, columns_found = sample_sheet(open_appearance(paths[0]))
+        columns = columns or columns_found
+    else:
+        channels = [read_channels(p) for p in paths]
+        names = [p.stem for p in paths]
+        if layer != "colour":
+            shown = [
+                show_layer(c, layer, str(p)) for c, p in zip(channels, paths, strict=True)
+            ]
+            return sheet(shown, columns, names if labels else None), 0.0
+        linear = [colour_of(c, str(p)) for c, p in zip(channels, paths, strict=True)]
+    factor = auto_exposure(linear) if exposure is None else 2.0**exposure
+    shown = [tone_map(p, factor, filmic) for p in linear]
+    return sheet(shown, columns, names if labels else None), math.log2(factor)
