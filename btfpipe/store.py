@@ -172,10 +172,15 @@ def create(path, kind, **about):
     with whole(path) as file:
         writer = Writer(file)
         writer.facts = about
-        yield writer
-        writer.about(
-            {"kind": kind, "format": FORMAT_VERSION, "btfpipe": __version__, **writer.facts}
-        )
+        try:
+            yield writer
+            writer.about(
+                {"kind": kind, "format": FORMAT_VERSION, "btfpipe": __version__, **writer.facts}
+            )
+        except BaseException:
+            with contextlib.suppress(Exception):
+                writer.close()  # or it complains when collected, after its file is gone
+            raise
         writer.close()
 
 
