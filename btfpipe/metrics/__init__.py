@@ -1,9 +1,30 @@
-"""Errors of pictures and BTFs, each with formula and unit."""
+"""Errors of pictures and BTFs, each with formula and unit.
+
+Two domains. *Linear*: the values themselves, radiance relative to a white diffuser. *Display*: the values divided by
+a stated white, clipped to [0, 1] and encoded by the sRGB curve, as a person sees them.
+"""
+
+from btfpipe.metrics.pictures import (
+    mean_squared_error,
+    psnr,
+    relative_error,
+    rmse,
+    ssim,
+    to_display,
+)
+
+__all__ = [
+    "mean_squared_error",
+    "psnr",
+    "raw_bytes",
+    "relative_error",
+    "rmse",
+    "ssim",
+    "to_display",
+]
 
 
 def raw_bytes(sample):
-    """Bytes that a Sample's pictures take uncompressed: 3 a texel and pair if 8-bit, 6 if high dynamic range."""
-    import numpy as np
-
-    each = 3 if sample.codes.dtype == np.uint8 else 6
+    """Bytes of a Sample's pictures, uncompressed: 3 a texel and pair if 8-bit, 6 (half floats) otherwise."""
+    each = 3 if sample.codes.dtype.itemsize == 1 else 6
     return each * sample.n_pairs * sample.shape[0] * sample.shape[1]

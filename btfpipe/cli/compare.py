@@ -1,0 +1,135 @@
+"""`btfpipe compare`: how far a Model is from a Sample."""
+
+from pathlib import Path
+
+import click
+
+from btfpipe.cli.options import input_file, progress, stage
+
+_WAYS = ("barycentric", "four", "nearest")
+_DEFINITIONS = {
+    "linear": "values as stored, linear Rec. 709",
+    "display": "linear values over white, clipped to [0, 1], sRGB curve",
+    "rmse": "sqrt(mean((model - sample)^2)) over pairs, valid texels and channels",
+    "psnr_db": "20 log10(peak / rmse), peak = white in linear and 1 in display; null: no error",
+    "relative_error": "sqrt(sum((model - sample)^2) / sum(sample^2)), linear",
+    "rmse_after_best_scale": "linear rmse of best_scale * model, for samples of unknown absolute scale",
+    "ssim": "Wang et al. 2004 on display luma, 11 x 11 Gaussian windows of 1.5 texels; mean over pairs;"
+    " null: under 11 texels",
+}
+
+
+@click.command()
+@click.argument("model", type=input_file())
+@click.argument("sample", type=input_file())
+@click.option(
+    "--interpolation",
+    "ways",
+    multiple=True,
+    type=click.Choice([*_WAYS, "all"]),
+    help="Evaluate MODEL between its directions, as rendering does; repeatable. By default only"
+    " where SAMPLE has a pair that MODEL lacks, barycentrically.",
+)
+@click.option(
+    "--picture",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Picture to write: errors over all pairs; the best, middle and worst picture.",
+)
+@stage(out="optional")
+def compare(model, sample, ways, picture, out, threads, quiet):
+    """Measure how far MODEL (a Model or a Sample) is from SAMPLE, at all of SAMPLE's direction pairs.
+
+    Writes a report in JSON: RMSE, PSNR, relative error and SSIM, overall and for each pair; bytes and their ratio.
+    With a SAMPLE of directions that MODEL never saw, this measures the interpolation too.
+
+    \b
+    Examples:
+      btfpipe compare corduroy.model.npz corduroy.sample.npz -o fidelity.json --picture fidelity.png
+      btfpipe compare weave.model.npz weave_truth.sample.npz --interpolation all -o truth.json
+    """  # fmt: skip
+    from btfpipe import store
+    from btfpipe.compression import open_appearance
+    from btfpipe.metrics import comparison, raw_bytes
+    from btfpipe.sample import Sample
+
+    if picture is not None and picture.exists() and not click.get_current_context().params["force"]:
+        raise click.UsageError(f"{picture} exists; pass --force to replace it.")
+    if picture is not None and not picture.parent.is_dir():
+        raise click.UsageError(f"{picture.parent}: no such folder; make it first.")
+    if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".tif"):
+        raise click.UsageError(f"{picture}: not a picture's name; end it in .png.")
+    reference = Sample.open(sample)
+    stand_in = open_appearance(model)
+    if "all" in ways:
+        ways = _WAYS
+    if not ways:
+        ways = (None,) if comparison.matching_pairs(stand_in, reference) is not None else _WAYS[:1]
+    white, white_is = comparison.white_level(reference)
+    results = {}
+    with progress("compare: pictures", quiet) as report:
+        for done_ways, way in enumerate(dict.fromkeys(ways)):
+            results[way or "own_pairs"] = comparison.compare(
+                stand_in,
+                reference,
+                interpolation=way,
+                threads=threads,
+                on_progress=lambda done, total: report(done_ways * total + done, len(ways) * total),  # noqa: B023
+            )
+    size, raw = model.stat().st_size, raw_bytes(reference)
+    facts = {
+        "texels": list(reference.shape),
+        "pairs": reference.n_pairs,
+        "white": white,
+        "bytes": size,
+        "sample_bytes": raw,
+        "ratio": raw / size,
+    }
+    overall = {name: result.overall() for name, result in results.items()}
+    if out is not None:
+        store.write_json(
+            out,
+            {
+                "model": {"file": model.name, "digest": store.digest(model)},
+                "sample": {"file": sample.name, "digest": store.digest(sample)},
+                **facts,
+                "definitions": _DEFINITIONS | {"white": white_is},
+                "comparisons": {
+                    name: overall[name] | {"per_pair": _per_pair(result, reference)}
+                    for name, result in results.items()
+                },
+            },
+        )
+    if picture is not None:
+        from btfpipe.formats.images import write_picture
+        from btfpipe.metrics.sheet import error_sheet
+
+        first = next(iter(results))
+        pictures_of = comparison.model_pictures(
+            stand_in, reference, None if first == "own_pairs" else first
+        )
+        write_picture(picture, error_sheet(reference, results, pictures_of))
+    for name, result in overall.items():
+        linear, display = result["linear"], result["display"]
+        if not quiet:
+            click.echo(
+                f"{name}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
+                f" {100 * (linear['relative_error'] or 0):.2f} %; display PSNR {_db(display['psnr_db'])}, SSIM"
+                f" {display['ssim'] if display['ssim'] is None else round(display['ssim'], 4)}",
+                err=True,
+            )
+    return {"inputs": [model, sample], **facts, "comparisons": overall}
+
+
+def _db(value):
+    return "infinite" if value is None else f"{value:.2f} dB"
+
+
+def _per_pair(result, sample):
+    columns = {
+        name: getattr(result, name) for name in ("rmse", "relative_error", "display_rmse", "ssim")
+    }
+    numbers = {
+        name: [None if value != value else float(f"{value:.6g}") for value in column]
+        for name, column in columns.items()
+    }
+    return {"light": sample.light_index, "view": sample.view_index, **numbers}
