@@ -1,0 +1,148 @@
+"""One level of the features, laid out for the search."""
+
+from collections import namedtuple
+
+import numpy as np
+from numba import njit
+
+from btfpipe.analysis.neighbours import coarse_texel, inside_range
+from btfpipe.errors import InputError
+from btfpipe.parallel import single_threaded_blas
+
+TABLE_LIMIT = 2048  # vectors whose distances are tabulated (16 MB); a plain feature image has one a texel
+
+# The tables of one level, for a neighbourhood of `side` texels:
+# labels (rows + side - 1, cols + side - 1) int32: with half a neighbourhood on each side.
+# table (n + 1, n + 1) float32: squared distances of the vectors, from the dot products; empty if unused.
+# image (rows + side - 1, cols + side - 1, d) float32 and vectors (n + 1, d) float32: the Euclidean form; empty if unused.
+Tables = namedtuple("Tables", "side labels table image vectors")
+
+# What the search knows of a level: its tables, those of the next coarser one (side 0: none), its
+# neighbour lists (texels, k), the numbers of rows and cols and the texels whose neighbourhood lies inside, and whether it is toroidal.
+Exemplar = namedtuple("Exemplar", "fine coarse lists rows cols inside toroidal")
+
+
+def exemplar(features, level, k=None, distance=None):
+    """Lay out one level of the features.
+
+    Parameters
+    ----------
+    features : Features
+    level : int
+    k : int, optional
+        Entries of the neighbour lists to use; None for full search, which needs no lists.
+    distance : str, optional
+        ``gram``: by the dot-product matrix; ``vectors``: by its Euclidean factor. By default the first for levels that
+        have such a matrix or few enough vectors, which is faster.
+
+    Returns
+    -------
+    Exemplar
+
+    Raises
+    ------
+    InputError
+        If the lists are missing or too short, or no texel's neighbourhood lies inside the sample.
+    """
+    here = features.levels[level]
+    below = features.levels[level + 1] if level + 1 < len(features.levels) else None
+    side = int(features.about["neighbourhood"])
+    coarse_side = int(features.about["coarse_neighbourhood"]) if below is not None else 0
+    rows, cols = here.shape
+    if k is None or k == 1:
+        lists = np.arange(rows * cols, dtype=np.int32)[:, None]
+    elif here.neighbours is None:
+        raise InputError(
+            f"level {level} of the features has no neighbour lists; make them with `btfpipe textons`, or pass"
+            " --search full."
+        )
+    elif here.neighbours.shape[2] < k:
+        raise InputError(
+            f"level {level} of the features has lists of {here.neighbours.shape[2]} neighbours, fewer than"
+            f" k = {k}; lower -k or make longer lists."
+        )
+    else:
+        lists = np.ascontiguousarray(here.neighbours[:, :, :k]).reshape(rows * cols, k)
+    coarse_shape = below.shape if below is not None else (0, 0)
+    inside = [
+        bound
+        for size, coarse_size in zip(here.shape, coarse_shape, strict=True)
+        for bound in inside_range(size, coarse_size, side, coarse_side, features.toroidal)
+    ]
+    if inside[0] >= inside[1] or inside[2] >= inside[3] or min(rows, cols) < side:
+        raise InputError(
+            f"level {level} of the sample has {rows} x {cols} texels, too few for a neighbourhood of"
+            f" {side} x {side}; take fewer --levels or a larger sample."
+        )
+    return Exemplar(
+        _tables(here, side, features.toroidal, distance),
+        _tables(below, coarse_side, features.toroidal, distance),
+        lists,
+        rows,
+        cols,
+        tuple(int(bound) for bound in inside),
+        features.toroidal,
+    )
+
+
+def _tables(level, side, toroidal, distance):
+    none = np.zeros((0, 0), np.float32)
+    if level is None:
+        return Tables(0, np.zeros((0, 0), np.int32), none, np.zeros((0, 0, 0), np.float32), none)
+    margin = ((side // 2, side // 2),) * 2
+    mode = "wrap" if toroidal else "edge"
+    labels = np.ascontiguousarray(np.pad(level.labels, margin, mode), np.int32)
+    if distance is None:
+        few = level.gram is not None or len(level.vectors) <= TABLE_LIMIT
+        distance = "gram" if few else "vectors"
+    if distance == "gram":
+        table = _square_distances(level)
+        return Tables(side, labels, table, np.zeros((0, 0, 0), np.float32), none)
+    vectors = np.ascontiguousarray(level.vectors, np.float32)
+    return Tables(side, labels, none, vectors[labels], vectors)
+
+
+def _square_distances(level):
+    """|t_i - t_j|^2 = G_ii + G_jj - 2 G_ij for all pairs of vectors, (n + 1, n + 1) float32."""
+    if level.gram is not None:
+        gram = np.asarray(level.gram, np.float64)
+    else:
+        vectors = np.asarray(level.vectors, np.float64)
+        vectors = vectors - vectors.mean(axis=0)
+        with single_threaded_blas():
+            gram = vectors @ vectors.T
+    square = np.diagonal(gram)
+    table = np.maximum(square[:, None] + square[None] - 2 * gram, 0)
+    np.fill_diagonal(table, 0)
+    return np.ascontiguousarray(table, np.float32)
+
+
+@njit(cache=True, inline="always")
+def texel_under(row, col, exemplar):
+    """Nearest texel ``row * cols + col`` of a coordinate, -1 beyond the border of a sample that is not toroidal."""
+    r = int(np.floor(row + 0.5))
+    c = int(np.floor(col + 0.5))
+    if exemplar.toroidal:
+        r %= exemplar.rows
+        c %= exemplar.cols
+    elif r < 0 or r >= exemplar.rows or c < 0 or c >= exemplar.cols:
+        return -1
+    return r * exemplar.cols + c
+
+
+@njit(cache=True, inline="always")
+def is_inside(texel, exemplar):
+    """Whether the texel's neighbourhoods lie inside the sample."""
+    r = texel // exemplar.cols
+    c = texel - r * exemplar.cols
+    low, high, left, right = exemplar.inside
+    return low <= r < high and left <= c < right
+
+
+@njit(cache=True, inline="always")
+def wrapped(x, size):
+    """The coordinate moved by whole periods into [-0.5, size - 0.5)."""
+    return x - size * np.floor((x + 0.5) / size)
+
+
+__all__ = ["Exemplar", "Tables", "coarse_texel", "exemplar", "is_inside", "texel_under", "wrapped"]

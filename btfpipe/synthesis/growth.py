@@ -1,0 +1,262 @@
+"""Growing a sample over a surface: the two-pass multi-resolution synthesis of Tong et al. 2002, section 5.
+
+Where this departs from the paper: the coarsest level is walked as a front, in its first sweep places not yet synthesised do not count (instead of
+counting as the random texels that they carry), every level is swept more than once, and the coordinate of a vertex is the mean of
+the runs that lead to its texel, which keeps coherent patches rigid.
+"""
+
+import time
+from collections import namedtuple
+
+import numpy as np
+from numba import njit
+
+from btfpipe.errors import InputError
+from btfpipe.hashing import uniform
+from btfpipe.parallel import blocks, ordered_map
+from btfpipe.sample.orientation import step_to_texels
+from btfpipe.surface.flatten import Flattener, frame_angle
+from btfpipe.synthesis import search
+from btfpipe.synthesis.coordinate_map import CoordinateMap
+from btfpipe.synthesis.exemplar import exemplar, texel_under
+
+_BLOCK = 4096  # vertices flattened at once: about 8 MB
+SWEEPS = (4, 2)  # on the coarsest level, on the others
+
+Grown = namedtuple("Grown", "row col label")
+
+
+def grow_over_surface(
+    features, surface, texels_per_unit=None, *, full=False, k=11, levels=3, sweeps=SWEEPS, turn=0.0, seed=0,
+    threads=1, distance=None, on_progress=None,
+):  # fmt: skip
+    """Grow a sample over a surface.
+
+    Parameters
+    ----------
+    features : Features
+    surface : Surface
+    texels_per_unit : float, optional
+        Texels of level 0 per unit of the surface's length; the same scale holds on every level. By default one texel per mean
+        edge of the surface's level 0.
+    full : bool
+        Full search instead of the k-coherent one.
+    k : int
+        Entries of each neighbour list that are tried; 1 is Ashikhmin's search for natural textures.
+    levels : int
+    sweeps : (int, int)
+        Times that the coarsest level and every other level are walked.
+    turn : float
+        Angle of the sample's s axis against the vector field, counter-clockwise, radians.
+    seed, threads : int
+    distance : str, optional
+        ``gram`` or ``vectors``; see `exemplar`.
+    on_progress : callable, optional
+        Gets vertices done and in all.
+
+    Returns
+    -------
+    CoordinateMap
+        With ``about["synthesis"]``: per level candidates, distances, fallbacks, seconds.
+
+    Raises
+    ------
+    InputError
+    """
+    for have, what, maker in (
+        (len(features.levels), "the features", "textons"),
+        (len(surface.levels), "the surface", "surface"),
+    ):
+        if have < levels:
+            raise InputError(
+                f"{what} have {have} levels, fewer than --levels {levels}; lower it, or make more with"
+                f" `btfpipe {maker}`."
+            )
+    spacing = mean_edge(surface.levels[0])
+    scale = 1.0 / spacing if texels_per_unit is None else float(texels_per_unit)
+    if not 0.25 <= scale * spacing <= 4.0:
+        raise InputError(
+            f"{scale:.4g} texels per unit are {scale * spacing:.3g} texels per edge of the surface; expected"
+            " 0.25 to 4 (1 is best). Resample the surface, or choose another scale."
+        )
+    total = sum(
+        len(surface.levels[i].vertices) * (sweeps[0] if i == levels - 1 else sweeps[1])
+        for i in range(levels)
+    )
+    done, report, below = 0, [], None
+    for i in reversed(range(levels)):
+        sample = exemplar(_cut(features, levels), i, None if full else k, distance)
+        mesh = Flattener(surface.levels[i], scale / 2**i, turn)
+        n = len(mesh.vertices)
+        state = Grown(np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32))
+        growing = below is None
+        if growing:
+            _scatter(sample, np.uint64(seed), *state)
+        else:
+            _inherit(surface.levels[i], mesh, coarse_mesh, below, coarse_sample, sample, state)
+        grown = np.full(n, not growing)
+        coarse_label = np.zeros(0, np.int32) if growing else below.label
+        order = breadth_first(mesh, int(seed) % n)
+        passes = sweeps[0] if growing else sweeps[1]
+        for sweep in range(passes):
+            tally = np.zeros(5)
+            start, searching = time.perf_counter(), 0.0
+
+            def flatten(block, i=i, mesh=mesh, order=order, sample=sample, growing=growing):
+                vertices = order[block]
+                patches = mesh.squares(vertices, sample.fine.side)
+                if growing:
+                    return vertices, patches, np.empty((0, 0, 3), np.int32), np.empty((0, 0, 3), np.float32)
+                level = surface.levels[i]
+                coarse = coarse_mesh.squares_at(
+                    level.parent_face[vertices], level.parent_weights[vertices], mesh.normals[vertices],
+                    mesh.tangents[vertices], sample.coarse.side,
+                )  # fmt: skip
+                return vertices, patches, *coarse
+
+            for vertices, patches, *coarse in ordered_map(flatten, blocks(n, _BLOCK), threads):
+                tick = time.perf_counter()
+                search.grow(
+                    vertices, patches, *coarse, sample, full, growing and sweep == 0, *state, grown,
+                    coarse_label, tally,
+                )  # fmt: skip
+                searching += time.perf_counter() - tick
+                done += len(vertices)
+                if on_progress is not None:
+                    on_progress(done, total)
+            report.append(
+                {
+                    "level": i,
+                    "sweep": sweep,
+                    "vertices": n,
+                    "candidates": tally[search.CANDIDATES] / n,
+                    "mean_distance": tally[search.DISTANCE] / n,
+                    "fallbacks": int(tally[search.FALLBACKS]),
+                    "starts": int(tally[search.STARTS]),
+                    "changed": tally[search.MOVED] / n,
+                    "search_seconds": searching,
+                    "seconds": time.perf_counter() - start,
+                }
+            )
+        below, coarse_mesh, coarse_sample = state, mesh, sample
+    return CoordinateMap(
+        state.row,
+        state.col,
+        np.full(len(state.row), turn, np.float32),
+        scale,
+        {"surface": surface.digest},
+        about={"synthesis": report},
+    )
+
+
+def _cut(features, levels):
+    """The features' first levels, so that the last of them has a one-level neighbourhood."""
+    if len(features.levels) == levels:
+        return features
+    return type(features)(features.levels[:levels], features.about)
+
+
+def mean_edge(level):
+    """Mean length of the edges of a mesh level."""
+    corners = np.asarray(level.vertices)[np.asarray(level.faces)]
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+
+@njit(cache=True, nogil=True)
+def _scatter(sample, seed, row, col, label):
+    """A random texel for every vertex."""
+    low, high, left, right = sample.inside
+    half = sample.fine.side // 2
+    for v in range(row.shape[0]):
+        r = low + int(uniform(seed, v, 0) * (high - low))
+        c = left + int(uniform(seed, v, 1) * (right - left))
+        row[v] = r
+        col[v] = c
+        label[v] = sample.fine.labels[r + half, c + half]
+
+
+def _inherit(level, mesh, coarse_mesh, below, coarse_sample, sample, state):
+    step = np.empty((len(mesh.vertices), 3, 2), np.float32)
+    face = np.ascontiguousarray(level.parent_face, np.int32)
+    weight = np.ascontiguousarray(level.parent_weights, np.float32)
+    _parent_steps(
+        mesh.normals, mesh.tangents, face, weight, coarse_mesh.vertices, coarse_mesh.faces,
+        coarse_mesh.normals, coarse_mesh.tangents, coarse_mesh.texels_per_unit, step,
+    )  # fmt: skip
+    search.inherit(
+        face, weight, coarse_mesh.faces, step, below.row, below.col, sample, coarse_sample.rows,
+        coarse_sample.cols, *state,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _parent_steps(
+    normals, tangents, face, weight, vertices, faces, coarse_normals, coarse_tangents, scale, step
+):  # fmt: skip
+    """Change of (row, col) from the corners of each vertex's coarse face to its place in it."""
+    place = np.empty(3)
+    for v in range(face.shape[0]):
+        for d in range(3):
+            place[d] = 0.0
+            for j in range(3):
+                place[d] += weight[v, j] * vertices[faces[face[v], j], d]
+        for j in range(3):
+            u = faces[face[v], j]
+            nx, ny, nz = coarse_normals[u, 0], coarse_normals[u, 1], coarse_normals[u, 2]
+            sx, sy, sz = coarse_tangents[u, 0], coarse_tangents[u, 1], coarse_tangents[u, 2]
+            tx, ty, tz = ny * sz - nz * sy, nz * sx - nx * sz, nx * sy - ny * sx
+            x, y, z = place[0] - vertices[u, 0], place[1] - vertices[u, 1], place[2] - vertices[u, 2]
+            ds, dt = x * sx + y * sy + z * sz, x * tx + y * ty + z * tz
+            length = np.sqrt(x * x + y * y + z * z)
+            stretch = scale * length / max(np.sqrt(ds * ds + dt * dt), 1e-12)
+            # In the frame half-way from the corner's to the vertex's, as in `flatten`.
+            angle = 0.5 * frame_angle(coarse_normals[u], coarse_tangents[u], normals[v], tangents[v])
+            cosine = np.cos(angle)
+            sine = np.sin(angle)
+            drow, dcol = step_to_texels(
+                stretch * (ds * cosine + dt * sine), stretch * (dt * cosine - ds * sine), 0.0
+            )
+            step[v, j, 0] = drow
+            step[v, j, 1] = dcol
+
+
+def breadth_first(mesh, start=0):
+    """Order in which a front that starts at a vertex, then in every part not yet reached, walks the mesh; (n,) int32."""
+    order = np.empty(len(mesh.vertices), np.int32)
+    _breadth_first(mesh.faces, mesh.twin, mesh.start, start, order)
+    return order
+
+
+@njit(cache=True, nogil=True)
+def _breadth_first(faces, twin, fan, start, order):
+    corner = faces.ravel()
+    n = order.shape[0]
+    reached = np.zeros(n, np.bool_)
+    count = 0
+    head = 0
+    for offset in range(n):
+        first = (start + offset) % n
+        if reached[first]:
+            continue
+        reached[first] = True
+        order[count] = first
+        count += 1
+        while head < count:
+            h = fan[order[head]]
+            head += 1
+            begin = h
+            while h >= 0:
+                f = 3 * (h // 3)
+                a = corner[f + (h + 1) % 3]
+                b = corner[f + (h + 2) % 3]
+                for u in (a, b):
+                    if not reached[u]:
+                        reached[u] = True
+                        order[count] = u
+                        count += 1
+                h = twin[f + (h + 2) % 3]
+                if h == begin:
+                    break
+
+
+__all__ = ["SWEEPS", "breadth_first", "grow_over_surface", "mean_edge", "texel_under"]

@@ -1,0 +1,311 @@
+"""The search of Tong et al. 2002, section 5: the best texel for each vertex, one vertex after the other.
+
+A neighbourhood pixel is a surface texton, a blend ``s = w0 t0 + w1 t1 + w2 t2`` of the textons of three
+vertices (equation 1). As the weights add up to one, its squared distance to a texton t is
+
+    |s - t|^2 = sum_i w_i |t_i - t|^2 - sum_{i<j} w_i w_j |t_i - t_j|^2,
+
+so the squared distances of the textons, which follow from the dot-product matrix, are all that is looked up. The Euclidean form of
+the same distance blends feature vectors instead; it serves plain feature images, which have a vector a texel.
+"""
+
+import numpy as np
+from numba import njit
+
+from btfpipe.synthesis.exemplar import coarse_texel, is_inside, texel_under, wrapped
+
+CANDIDATES, DISTANCE, FALLBACKS, STARTS, MOVED = range(5)  # places in the tally
+_FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(cache=True, nogil=True)
+def _resample(vertex, weight, skip, label, done, tables, base, share, constant, blend):
+    """Blend the textons under each pixel of a neighbourhood; returns the number of pixels that count.
+
+    Pixels that no triangle covers carry the default texton. With `skip`, vertices not yet synthesised are left out, and with
+    them the pixels that mostly hang on them.
+    """
+    default = max(tables.table.shape[0], tables.vectors.shape[0]) - 1
+    n = tables.table.shape[0]
+    counting = 0
+    for p in range(vertex.shape[0]):
+        if vertex[p, 0] < 0:
+            base[p, 0] = base[p, 1] = base[p, 2] = default
+            share[p, 0] = 1.0
+            share[p, 1] = share[p, 2] = 0.0
+        else:
+            total = np.float32(0.0)
+            for j in range(3):
+                u = vertex[p, j]
+                base[p, j] = label[u]
+                share[p, j] = weight[p, j]
+                if skip and not done[u]:
+                    share[p, j] = 0.0
+                total += share[p, j]
+            if total < 0.5:
+                share[p, 0] = share[p, 1] = share[p, 2] = 0.0
+                constant[p] = 0.0
+                if n == 0:
+                    blend[p, :] = 0.0
+                continue
+            for j in range(3):
+                share[p, j] /= total
+        counting += 1
+        a, b, c = base[p, 0], base[p, 1], base[p, 2]
+        wa, wb, wc = share[p, 0], share[p, 1], share[p, 2]
+        if n > 0:
+            constant[p] = (
+                wa * wb * tables.table[a, b]
+                + wb * wc * tables.table[b, c]
+                + wc * wa * tables.table[c, a]
+            )
+            base[p, 0] = a * n
+            base[p, 1] = b * n
+            base[p, 2] = c * n
+        else:
+            for i in range(blend.shape[1]):
+                blend[p, i] = (
+                    wa * tables.vectors[a, i]
+                    + wb * tables.vectors[b, i]
+                    + wc * tables.vectors[c, i]
+                )
+    return counting
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _square(r, c, tables, base, share, constant, blend, total, limit):
+    """`total` plus the distance of the resampled neighbourhood to that of texel (r, c); given up row by row above `limit`."""
+    side = tables.side
+    if tables.table.shape[0] > 0:
+        width = tables.labels.shape[1]
+        flat = tables.labels.ravel()
+        table = tables.table.ravel()
+        p = 0
+        for i in range(side):
+            run = (r + i) * width + c
+            for j in range(side):
+                t = flat[run + j]
+                total += (
+                    share[p, 0] * table[base[p, 0] + t]
+                    + share[p, 1] * table[base[p, 1] + t]
+                    + share[p, 2] * table[base[p, 2] + t]
+                    - constant[p]
+                )
+                p += 1
+            if total >= limit:
+                return total
+        return total
+    depth = tables.image.shape[2]
+    width = tables.image.shape[1] * depth
+    flat = tables.image.ravel()
+    for i in range(side):
+        run = (r + i) * width + c * depth
+        for j in range(side):
+            p = i * side + j
+            if share[p, 0] + share[p, 1] + share[p, 2] > 0.5:
+                part = np.float32(0.0)
+                for d in range(depth):
+                    step = blend[p, d] - flat[run + j * depth + d]
+                    part += step * step
+                total += part
+        if total >= limit:
+            return total
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _two_levels(texel, exemplar, fine, coarse, limit):
+    """Distance of the vertex's neighbourhoods to those of a texel, the coarser level first."""
+    r = texel // exemplar.cols
+    c = texel - r * exemplar.cols
+    total = np.float32(0.0)
+    if exemplar.coarse.side > 0:
+        total = _square(coarse_texel(r), coarse_texel(c), exemplar.coarse, *coarse, total, limit)
+        if total >= limit:
+            return total
+    return _square(r, c, exemplar.fine, *fine, total, limit)
+
+
+@njit(cache=True, nogil=True)
+def _room(tables):
+    """Scratch for one neighbourhood: base, share, constant, blend."""
+    pixels = tables.side * tables.side
+    return (
+        np.zeros((pixels, 3), np.int64),
+        np.zeros((pixels, 3), np.float32),
+        np.zeros(pixels, np.float32),
+        np.zeros((pixels, tables.vectors.shape[1]), np.float32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def grow(
+    vertices, patches, coarse_vertex, coarse_weight, exemplar, full, skip, row, col, label, done,
+    coarse_label, tally,
+):  # fmt: skip
+    """Synthesise the given vertices in order.
+
+    Parameters
+    ----------
+    vertices : (n,) int32
+    patches : Patches
+        Of these vertices.
+    coarse_vertex, coarse_weight : (n, p, 3) int32, float32
+        Neighbourhoods on the coarser level; n = 0 for none.
+    exemplar : Exemplar
+    full : bool
+        All texels are candidates, instead of the k-coherent ones.
+    skip : bool
+        Leave out of the neighbourhoods what is not `done`.
+    row, col : (all vertices,) float32
+        Coordinates; changed in place, as are `label` (int32) and `done` (bool).
+    coarse_label : (vertices of the coarser level,) int32
+    tally : (5,) float64
+        Sums: candidates compared, distances of those chosen, fallbacks, starts, vertices whose texel changed.
+    """
+    fine = _room(exemplar.fine)
+    coarse = _room(exemplar.coarse)
+    compared = np.full(exemplar.rows * exemplar.cols, -1, np.int32)  # the last vertex that did
+    listed = np.full(exemplar.rows * exemplar.cols, -1, np.int32)
+    always = np.ones(1, np.bool_)
+    low, high, left, right = exemplar.inside
+    for i in range(vertices.shape[0]):
+        v = vertices[i]
+        counting = _resample(
+            patches.pixel_vertex[i], patches.pixel_weight[i], skip, label, done, exemplar.fine, *fine
+        )
+        if exemplar.coarse.side > 0:
+            _resample(
+                coarse_vertex[i], coarse_weight[i], False, coarse_label, always, exemplar.coarse, *coarse
+            )  # fmt: skip
+        best = -1
+        best_distance = np.float32(np.inf)
+        best_row = np.float32(0.0)
+        best_col = np.float32(0.0)
+        found = 0
+        if not full:
+            for j in range(patches.patch_vertex.shape[1]):
+                u = patches.patch_vertex[i, j]
+                if u < 0:
+                    break
+                if not done[u]:
+                    continue
+                r = row[u] + patches.patch_step[i, j, 0]
+                c = col[u] + patches.patch_step[i, j, 1]
+                owner = texel_under(r, c, exemplar)
+                if owner < 0 or listed[owner] == i:
+                    continue
+                listed[owner] = i
+                for e in range(exemplar.lists.shape[1]):
+                    texel = exemplar.lists[owner, e]
+                    if compared[texel] == i or (e == 0 and not is_inside(texel, exemplar)):
+                        continue
+                    compared[texel] = i
+                    found += 1
+                    distance = _two_levels(texel, exemplar, fine, coarse, best_distance)
+                    if distance < best_distance:
+                        best_distance = distance
+                        best = texel
+                        best_row = r - np.floor(r + np.float32(0.5))
+                        best_col = c - np.floor(c + np.float32(0.5))
+        if counting == 0:
+            tally[STARTS] += 1
+            done[v] = True
+            continue
+        if best < 0:
+            if not full:
+                tally[FALLBACKS] += 1
+            for r in range(low, high):
+                for c in range(left, right):
+                    texel = r * exemplar.cols + c
+                    found += 1
+                    distance = _two_levels(texel, exemplar, fine, coarse, best_distance)
+                    if distance < best_distance:
+                        best_distance = distance
+                        best = texel
+        # The fraction: the mean of all runs that lead to this texel, so that a run that closes on itself stays rigid.
+        r0 = best // exemplar.cols
+        c0 = best - r0 * exemplar.cols
+        sum_row = np.float32(0.0)
+        sum_col = np.float32(0.0)
+        runs = np.float32(0.0)
+        for j in range(patches.patch_vertex.shape[1]):
+            u = patches.patch_vertex[i, j]
+            if u < 0:
+                break
+            if not done[u]:
+                continue
+            dr = row[u] + patches.patch_step[i, j, 0] - r0
+            dc = col[u] + patches.patch_step[i, j, 1] - c0
+            if exemplar.toroidal:
+                dr -= exemplar.rows * np.floor(dr / exemplar.rows + np.float32(0.5))
+                dc -= exemplar.cols * np.floor(dc / exemplar.cols + np.float32(0.5))
+            if abs(dr) <= 0.75 and abs(dc) <= 0.75:
+                sum_row += dr
+                sum_col += dc
+                runs += np.float32(1.0)
+        if runs > 0:
+            best_row = min(max(sum_row / runs, np.float32(-0.49)), np.float32(0.49))
+            best_col = min(max(sum_col / runs, np.float32(-0.49)), np.float32(0.49))
+        if texel_under(row[v], col[v], exemplar) != best:
+            tally[MOVED] += 1
+        row[v] = r0 + best_row
+        col[v] = c0 + best_col
+        label[v] = exemplar.fine.labels[r0 + exemplar.fine.side // 2, c0 + exemplar.fine.side // 2]
+        done[v] = True
+        tally[CANDIDATES] += found
+        tally[DISTANCE] += best_distance
+
+
+@njit(cache=True, nogil=True)
+def inherit(face, weight, parent_faces, step, parent_row, parent_col, exemplar, rows, cols, row, col, label):
+    """First pass (section 5.1): coordinates from the places on the coarser level.
+
+    Parameters
+    ----------
+    face, weight : (n,) int32, (n, 3) float32
+        Places on the coarser level.
+    parent_faces : (m, 3) int32
+    step : (n, 3, 2) float32
+        Change of (row, col), in coarse texels, from each corner of the face to the place.
+    parent_row, parent_col : float32
+        Coordinates of the coarser level, whose sample has `rows` x `cols` texels.
+    exemplar : Exemplar
+        Of the finer level.
+    row, col, label : (n,)
+        Filled in.
+    """
+    for v in range(face.shape[0]):
+        heaviest = 0
+        for j in range(1, 3):
+            if weight[v, j] > weight[v, heaviest]:
+                heaviest = j
+        u = parent_faces[face[v], heaviest]
+        r0 = parent_row[u] + step[v, heaviest, 0]
+        c0 = parent_col[u] + step[v, heaviest, 1]
+        sum_row = 0.0
+        sum_col = 0.0
+        total = 0.0
+        for j in range(3):  # corners of the same run are blended
+            u = parent_faces[face[v], j]
+            dr = parent_row[u] + step[v, j, 0] - r0
+            dc = parent_col[u] + step[v, j, 1] - c0
+            if exemplar.toroidal:
+                dr -= rows * np.floor(dr / rows + 0.5)
+                dc -= cols * np.floor(dc / cols + 0.5)
+            if abs(dr) <= 0.75 and abs(dc) <= 0.75:
+                sum_row += weight[v, j] * dr
+                sum_col += weight[v, j] * dc
+                total += weight[v, j]
+        r = 2.0 * (r0 + sum_row / total) + 0.5
+        c = 2.0 * (c0 + sum_col / total) + 0.5
+        if exemplar.toroidal:
+            r = wrapped(r, exemplar.rows)
+            c = wrapped(c, exemplar.cols)
+        else:
+            r = min(max(r, 0.0), exemplar.rows - 1.0)
+            c = min(max(c, 0.0), exemplar.cols - 1.0)
+        row[v] = r
+        col[v] = c
+        half = exemplar.fine.side // 2
+        label[v] = exemplar.fine.labels[int(np.floor(r + 0.5)) + half, int(np.floor(c + 0.5)) + half]
