@@ -8,6 +8,7 @@ pictures' weights, the dot product of two full vectors is the sum over filters o
 vectors of 48 n numbers with the same lengths and distances; everything below happens in that space.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -90,7 +91,7 @@ def texton_features(
             count = min(max(2, n_textons // 4**level), image.shape[0] * image.shape[1] // 2)
             textons = cluster(responses, count, seed)
             made.append(texton_level(textons, image.shape[:2]))
-            facts.append((textons, len(made[-1].vectors[0])))
+            facts.append((textons, made[-1].vectors.shape[1]))
             del responses
             report(2 * level + 4, steps)
     about = {
@@ -187,14 +188,29 @@ def representative_pictures(textures, angular, toroidal, count, seed=0, threads=
     return np.sort(order[first])
 
 
+@dataclass
 class Textons:
-    """A vocabulary in the space of full vectors: centres (n, d) float64, labels (texels,) int32, and how good they are."""
+    """A vocabulary in the space of full vectors.
 
-    def __init__(self, centres, labels, inertia, share):
-        self.centres = centres
-        self.labels = labels
-        self.inertia = inertia
-        self.share = share
+    Attributes
+    ----------
+    centres : (n, d) float64
+        Means of the clusters.
+    members : (texels,) int
+        Cluster of each texel.
+    labels : (texels,) int32
+        Nearest centre of each texel, the texton map; here and there another than its cluster's.
+    inertia : float
+        Mean squared distance of texels to their nearest centre, as a share of their variance.
+    share : float
+        Share of the variance that the clustering saw.
+    """
+
+    centres: np.ndarray
+    members: np.ndarray
+    labels: np.ndarray
+    inertia: float
+    share: float
 
 
 def cluster(vectors, count, seed=0):
@@ -213,17 +229,17 @@ def cluster(vectors, count, seed=0):
     Returns
     -------
     Textons
-        `inertia` and `share` as parts of the vectors' variance: left by the centres, and kept by the projection.
     """
     reduced, share = reduce(vectors, _CLUSTER_DIMENSIONS, seed)
-    count, labels = _kmeans(reduced, count, seed)
-    centres = _means(vectors, labels, count)
+    count, members = _kmeans(reduced, count, seed)
+    centres = _means(vectors, members, count)
     labels, squares = _nearest(vectors, centres)
     mean = vectors.mean(axis=0, dtype=np.float64)
     total = sum(
         float(np.square(vectors[b].astype(np.float64) - mean).sum()) for b in blocks(len(vectors), _BLOCK)
     )  # fmt: skip
-    return Textons(centres, labels, float(squares / total) if total > 0 else 0.0, share)
+    inertia = squares / total if total > 0 else 0.0
+    return Textons(centres, members, labels, inertia, share)
 
 
 def reduce(vectors, dimensions, seed=0):

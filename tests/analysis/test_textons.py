@@ -1,0 +1,219 @@
+"""Textons: the short way through eigen-textures against the long way through every picture."""
+
+import numpy as np
+import pytest
+
+from btfpipe.analysis import Features
+from btfpipe.analysis.filters import base_sigma, filter_pictures, leung_malik
+from btfpipe.analysis.textons import (
+    appearance_vectors,
+    cluster,
+    eigen_textures,
+    picture_weights,
+    representative_pictures,
+    texton_features,
+    texton_level,
+)
+from btfpipe.compression.svd import SvdModel, compress_svd
+from btfpipe.errors import InputError
+
+
+def filter_all(pictures, toroidal):
+    """Responses (texels, filter, picture, channel) float64 of pictures (n, rows, cols, 3)."""
+    n, rows, cols, _ = pictures.shape
+    planes = pictures.transpose(0, 3, 1, 2).reshape(3 * n, rows, cols)
+    responses = np.stack(
+        list(filter_pictures(planes, leung_malik(base_sigma(rows, cols)), toroidal))
+    )
+    return responses.astype(float).reshape(48, n, 3, rows * cols).transpose(3, 0, 1, 2)
+
+
+def distances(vectors):
+    """All squared distances (n, n) float64."""
+    vectors = np.asarray(vectors, float)
+    vectors = vectors - vectors.mean(axis=0)
+    square = (vectors**2).sum(axis=1)
+    return square[:, None] + square[None] - 2 * vectors @ vectors.T
+
+
+@pytest.fixture
+def sample(make_sample):
+    return make_sample(16, 20, toroidal=True)
+
+
+@pytest.fixture
+def model(sample):
+    return compress_svd(sample, 12, precision="single")
+
+
+def test_responses_of_eigen_textures_are_those_of_the_models_own_pictures(model):
+    explicit = filter_all(model.pictures(slice(None)), toroidal=True)
+    short = appearance_vectors(model.texture_factors, True).reshape(320, 48, -1)
+    combined = np.einsum("pfn,acn->pfac", short, model.angular_factors)
+    assert np.abs(combined - explicit).max() < 2e-6 * np.abs(explicit).max()
+
+
+def test_responses_are_those_of_the_original_pictures_within_the_compression_error(sample):
+    model = compress_svd(sample, 4, precision="single")
+    assert model.about["relative_error"] > 0.01
+    original = filter_all(sample.pictures(slice(None)), toroidal=True)
+    short = filter_all(model.pictures(slice(None)), toroidal=True)
+    # absolute values of a filter sum to 1, so on a torus it lengthens no picture
+    error = np.sqrt(((original - short) ** 2).mean(axis=(0, 2, 3)))
+    assert error.max() <= model.about["rmse"] * 1.0001
+    assert error.max() > 0.1 * model.about["rmse"]
+
+
+def test_dot_products_and_distances_are_those_of_the_explicit_vectors(model, rng):
+    pictures = np.sort(rng.choice(model.n_pairs, 40, replace=False))
+    explicit = filter_all(model.pictures(pictures), toroidal=True).reshape(320, -1)
+    assert explicit.shape[1] == 48 * 40 * 3
+    textures, angular = eigen_textures(model)
+    short = appearance_vectors(textures @ picture_weights(angular[pictures]), True).astype(float)
+    assert np.allclose(short @ short.T, explicit @ explicit.T, rtol=1e-5)
+    far = distances(explicit)
+    assert np.abs(distances(short) - far).max() < 1e-5 * far.max()
+
+
+def test_gram_distances_and_texton_map_are_those_of_the_explicit_appearance_vectors(model):
+    explicit = filter_all(model.pictures(slice(None)), toroidal=True).reshape(320, -1)
+    textures, angular = eigen_textures(model)
+    textons = cluster(appearance_vectors(textures @ picture_weights(angular), True), 30)
+    level = texton_level(textons, model.shape)
+    centres = np.stack([explicit[textons.members == i].mean(axis=0) for i in range(30)])
+    centres = np.concatenate([centres, centres.mean(axis=0, keepdims=True)])
+    far = distances(centres)
+    gram = np.asarray(level.gram, float)
+    by_gram = np.diagonal(gram)[:, None] + np.diagonal(gram)[None] - 2 * gram
+    assert np.abs(by_gram - far).max() < 1e-5 * far.max()
+    assert np.abs(distances(level.vectors) - far).max() < 1e-4 * far.max()
+    to_centres = (
+        (explicit**2).sum(axis=1)[:, None]
+        + (centres[:-1] ** 2).sum(axis=1)
+        - 2 * explicit @ centres[:-1].T
+    )
+    chosen = to_centres[np.arange(320), level.labels.ravel()]
+    assert (chosen <= to_centres.min(axis=1) + 1e-5 * far.max()).all()
+    spread = ((explicit - explicit.mean(axis=0)) ** 2).sum()
+    assert textons.inertia == pytest.approx(chosen.sum() / spread, rel=1e-3)
+
+
+def test_clustering_in_the_projection_is_as_good_as_in_the_full_space(make_sample):
+    from scipy.ndimage import gaussian_filter
+    from sklearn.cluster import KMeans
+    from threadpoolctl import threadpool_limits
+
+    sample = make_sample(32, 32, toroidal=True)
+    sample.codes = gaussian_filter(sample.codes, (0, 1, 1, 0), mode="wrap")
+    model = compress_svd(sample, 20, precision="single")
+    explicit = filter_all(model.pictures(slice(None)), toroidal=True).reshape(1024, -1)
+    with threadpool_limits(1):
+        full = KMeans(60, n_init=1, random_state=0).fit(explicit.astype(np.float32))
+    full = full.inertia_ / ((explicit - explicit.mean(axis=0)) ** 2).sum()
+    textures, angular = eigen_textures(model)
+    textons = cluster(appearance_vectors(textures @ picture_weights(angular), True), 60)
+    assert textons.share > 0.99
+    assert textons.inertia < 1.02 * full
+
+
+def test_the_default_texton_is_the_mean_and_the_origin(model):
+    features = texton_features(model, levels=1, n_textons=40, k=5)
+    level = features.levels[0]
+    assert level.gram.shape == (41, 41)
+    assert not level.vectors[-1].any()
+    assert np.abs(level.vectors[:-1].mean(axis=0)).max() < 1e-5 * np.abs(level.vectors).max()
+    assert np.abs(level.gram[-1]).max() < 1e-5 * level.gram.max()
+
+
+def test_each_level_has_a_quarter_of_the_textons(make_sample):
+    model = compress_svd(make_sample(32, 48, toroidal=True), 12)
+    features = texton_features(model, levels=3, n_textons=200, k=5)
+    assert [level.shape for level in features.levels] == [(32, 48), (16, 24), (8, 12)]
+    assert [len(level.vectors) - 1 for level in features.levels] == [200, 50, 12]
+    for level in features.levels:
+        assert level.labels.max() < len(level.vectors) - 1
+        assert level.neighbours.shape == (*level.shape, 5)
+
+
+def test_alike_texels_share_textons_and_unlike_ones_do_not(make_sample):
+    """Stripes of two materials, eight texels wide: period 16, so labels repeat with it and no texton is in both."""
+    sample = make_sample(32, 32, toroidal=True)
+    stripe = (np.arange(32) // 8 % 2).astype(bool)
+    sample.codes[:, :, stripe] *= 0.2
+    sample.codes[:] = sample.codes.mean(axis=1, keepdims=True)
+    sample.codes[:, :, 16:] = sample.codes[:, :, :16]
+    labels = texton_features(sample, levels=1, n_textons=16, k=5).levels[0].labels
+    assert (labels == labels[:1]).all()
+    assert np.array_equal(labels[:, :16], labels[:, 16:])
+    assert not set(labels[0, stripe]) & set(labels[0, ~stripe])
+
+
+def test_representative_pictures_come_one_from_each_kind(model):
+    """Sixty pictures of three kinds, equal but for a trace of noise."""
+    textures, angular = eigen_textures(model)
+    rng = np.random.default_rng(5)
+    kinds = rng.permutation(np.repeat(np.arange(3), 20))
+    many = angular[[0, 40, 100]][kinds] * (1 + 1e-3 * rng.normal(size=(60, 1, 1)))
+    chosen = representative_pictures(textures, many.astype(np.float32), True, 3)
+    assert sorted(kinds[chosen]) == [0, 1, 2]
+    assert np.array_equal(representative_pictures(textures, many, True, 60), np.arange(60))
+
+
+def test_representative_pictures_are_nearest_to_their_clusters_centre(model):
+    textures, angular = eigen_textures(model)
+    chosen = representative_pictures(textures, angular, True, 20)
+    assert len(chosen) == 20
+    assert (np.diff(chosen) > 0).all()
+    pictures = model.pictures(slice(None)).reshape(model.n_pairs, -1)
+    to_chosen = np.sqrt(((pictures[:, None] - pictures[chosen][None]) ** 2).sum(axis=2)).min(axis=1)
+    rng = np.random.default_rng(0)
+    for _ in range(5):  # pictures drawn at random stand for the others less well
+        drawn = pictures[rng.choice(model.n_pairs, 20, replace=False)]
+        to_drawn = np.sqrt(((pictures[:, None] - drawn[None]) ** 2).sum(axis=2)).min(axis=1)
+        assert to_chosen.mean() < to_drawn.mean()
+
+
+def test_one_picture_is_enough(make_sample):
+    from btfpipe.directions import bonn81
+
+    sample = make_sample(16, 16, lights=bonn81()[:1], views=bonn81()[:1], toroidal=True)
+    features = texton_features(sample, levels=2, n_textons=50, k=5)
+    assert features.about["pictures"] == 1
+    assert features.about["svd_terms"] <= 3
+
+
+def test_threads_do_not_change_the_file(btfpipe, sample, tmp_path):
+    sample.save(tmp_path / "s.npz")
+    for threads in (1, 2):
+        btfpipe(
+            "textons", tmp_path / "s.npz", "-o", tmp_path / f"{threads}.npz", "--threads", threads,
+            "--levels", 2, "--textons", 30, "--images", 20, "-k", 6, "--json",
+        )  # fmt: skip
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+    features = Features.open(tmp_path / "1.npz")
+    assert features.toroidal
+    assert features.about["neighbourhood"] == 5
+    assert features.about["pictures"] == 20
+
+
+def test_not_a_number_is_refused_with_its_place(model):
+    textures = model.texture_factors.copy()
+    textures[3, 4, 0] = np.nan
+    with pytest.raises(InputError, match="the first at row 3, col 4"):
+        texton_features(SvdModel(textures, model.angular_factors, model), levels=1)
+    angular = model.angular_factors.copy()
+    angular[7, 1, 0] = np.inf
+    with pytest.raises(InputError, match="first for pair 7"):
+        texton_features(SvdModel(model.texture_factors, angular, model), levels=1)
+
+
+def test_responses_beyond_the_memory_are_refused_before_filtering(model):
+    with pytest.raises(InputError, match="--memory allows 0 MB"):
+        texton_features(model, levels=1, memory=100_000)
+
+
+def test_small_sample_exits_3_and_writes_nothing(btfpipe, make_sample, tmp_path):
+    make_sample(12, 12).save(tmp_path / "s.npz")
+    result = btfpipe("textons", tmp_path / "s.npz", "-o", tmp_path / "t.npz", code=3)
+    assert "3 x 3 texels on level 2" in result.stderr
+    assert not (tmp_path / "t.npz").exists()
