@@ -10,13 +10,27 @@ from btfpipe.errors import InputError
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=input_file(dir_okay=False))
-@click.option("--columns", type=click.IntRange(1), help="Pictures across the sheet.", show_default="square")
-@click.option("--exposure", type=float, metavar="EV", show_default="automatic",
-              help="Brighten by this many doublings, the same for all pictures.")
+@click.option(
+    "--columns", type=click.IntRange(1), help="Pictures across the sheet.", show_default="square"
+)
+@click.option(
+    "--exposure",
+    type=float,
+    metavar="EV",
+    show_default="automatic",
+    help="Brighten by this many doublings, the same for all pictures.",
+)
 @click.option("--filmic", is_flag=True, help="Bend highlights to white instead of clipping them.")
-@click.option("--layer", type=click.Choice(["colour", "alpha", "depth", "normal", "texel"]), default="colour",
-              show_default=True, help="Layer of rendered pictures to show.")
-@click.option("--labels", is_flag=True, help="Write file names, or directions in degrees, below the pictures.")
+@click.option(
+    "--layer",
+    type=click.Choice(["colour", "alpha", "depth", "normal", "texel"]),
+    default="colour",
+    show_default=True,
+    help="Layer of rendered pictures to show.",
+)
+@click.option(
+    "--labels", is_flag=True, help="Write file names, or directions in degrees, below the pictures."
+)
 @stage()
 def preview(files, columns, exposure, filmic, layer, labels, out):
     """Tone-map rendered pictures into one PNG, or show a Sample or Model under many lights and views.

@@ -287,8 +287,10 @@ def transformed(thing, transform):
 
 @njit(cache=True, nogil=True)
 def winding_number(vertices, faces, x, y, z):
-    """Sum of the faces' solid angles from a point over 4 pi: 1 inside a closed mesh, 0 outside (van Oosterom
-    and Strackee 1983)."""
+    """Solid angle of all faces from a point over 4 pi: 1 inside a closed mesh, 0 outside.
+
+    The angle of a face by van Oosterom and Strackee (1983).
+    """
     total = 0.0
     for f in range(len(faces)):
         ax, ay, az = (

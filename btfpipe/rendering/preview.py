@@ -188,9 +188,7 @@ def sample_sheet(appearance, lights=6, views=6):
     view = _spread(appearance.view_directions, views)
     pair_of = {
         (int(v), int(i)): n
-        for n, (v, i) in enumerate(
-            zip(appearance.view_index, appearance.light_index, strict=True)
-        )
+        for n, (v, i) in enumerate(zip(appearance.view_index, appearance.light_index, strict=True))
     }
     pictures, labels = [], []
     for v in view:
@@ -261,9 +259,7 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
         channels = [read_channels(p) for p in paths]
         names = [p.stem for p in paths]
         if layer != "colour":
-            shown = [
-                show_layer(c, layer, str(p)) for c, p in zip(channels, paths, strict=True)
-            ]
+            shown = [show_layer(c, layer, str(p)) for c, p in zip(channels, paths, strict=True)]
             return sheet(shown, columns, names if labels else None), 0.0
         linear = [colour_of(c, str(p)) for c, p in zip(channels, paths, strict=True)]
     factor = auto_exposure(linear) if exposure is None else 2.0**exposure

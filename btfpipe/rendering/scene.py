@@ -24,8 +24,11 @@ class Film:
 
 @dataclass
 class Light:
-    """A directional light (`place` is the direction towards it, `power` its irradiance) or a point light (its
-    position, its intensity)."""
+    """A directional or a point light.
+
+    `place` is the unit vector towards it, or its position; `power` the irradiance of a surface that faces it, or its
+    intensity in W/sr.
+    """
 
     directional: bool
     place: np.ndarray

@@ -1,0 +1,135 @@
+"""Lights, shadows, films: against the laws of geometry."""
+
+import numpy as np
+import pytest
+
+from btfpipe.rendering.camera import filter_table, strata
+
+GROUND = {
+    "plane": {"center": [0, -1, 0], "s": [1, 0, 0], "t": [0, 0, -1], "size": [12, 12]},
+    "albedo": [0.8, 0.4, 0.2],
+}
+ABOVE = {
+    "type": "orthographic",
+    "position": [0, 8, 0],
+    "target": [0, 0, 0],
+    "up": [0, 0, -1],
+    "height": 6,
+}
+
+
+def test_point_light_falls_off_with_the_square_of_the_distance(scene_file, render_file):
+    height = 2.0
+    lamp = {"type": "point", "position": [0.5, -1 + height, 0], "intensity": [10, 20, 30]}
+    picture = render_file(scene_file([GROUND], camera=ABOVE, lights=[lamp]))
+    x, z = np.meshgrid((np.arange(64) + 0.5) / 64 * 6 - 3, (np.arange(64) + 0.5) / 64 * 6 - 3)
+    squared = (x - 0.5) ** 2 + z**2 + height**2
+    irradiance = np.array([10, 20, 30]) * (height / np.sqrt(squared) / squared)[..., None]
+    expected = irradiance * [0.8, 0.4, 0.2] / np.pi
+    np.testing.assert_allclose(picture[..., :3], expected, rtol=1e-4)
+
+
+def test_two_lights_add_up(scene_file, render_file):
+    lamps = [
+        {"type": "directional", "direction": [1, 2, 0], "irradiance": [1, 2, 3]},
+        {"type": "point", "position": [0, 4, 1], "intensity": [30, 20, 10]},
+    ]
+    both = render_file(scene_file([GROUND], camera=ABOVE, lights=lamps))
+    alone = [render_file(scene_file([GROUND], camera=ABOVE, lights=[lamp])) for lamp in lamps]
+    np.testing.assert_allclose(both[..., :3], alone[0][..., :3] + alone[1][..., :3], rtol=1e-5)
+
+
+def test_sphere_throws_the_shadow_that_geometry_says(
+    sphere, lambertian, scene_file, render_file, tmp_path
+):
+    lambertian().save(tmp_path / "m.sample.npz")
+    entry = sphere()
+    direction = np.array([1.0, 1.0, 0.3])
+    direction /= np.linalg.norm(direction)
+    lamp = {"type": "directional", "direction": direction, "irradiance": [np.pi] * 3}
+    film = {"width": 96, "height": 96, "samples": 1, "filter": "box"}
+    picture = render_file(scene_file([entry, GROUND], camera=ABOVE, lights=[lamp], film=film))
+    x, z = np.meshgrid((np.arange(96) + 0.5) / 96 * 6 - 3, (np.arange(96) + 0.5) / 96 * 6 - 3)
+    point = np.stack([x, np.full_like(x, -1), z], axis=-1)
+    nearest = np.linalg.norm(np.cross(point, direction), axis=-1)  # of the shadow ray to the centre
+    seen = x**2 + z**2 > 1.02**2
+    shadow, light = (nearest < 0.97) & seen, (nearest > 1.03) & seen
+    assert shadow.sum() > 100
+    assert (picture[shadow][:, :3] == 0).all()
+    expected = np.broadcast_to(np.array([0.8, 0.4, 0.2]) * direction[1], (96, 96, 3))
+    np.testing.assert_allclose(picture[..., :3][light], expected[light], rtol=1e-5)
+
+
+@pytest.mark.parametrize("rings", [16, 96])
+def test_facets_do_not_shade_a_smooth_surface(
+    rings, sphere, lambertian, scene_file, render_file, tmp_path
+):
+    """Where light grazes, a facet lies in its neighbours' shadow though the smooth surface does not."""
+    lambertian().save(tmp_path / "m.sample.npz")
+    entry = sphere(rings=rings, segments=2 * rings)
+    lamp = {"type": "directional", "direction": [1, 0.3, -0.2], "irradiance": [np.pi] * 3}
+    film = {"width": 200, "height": 200, "samples": 1, "filter": "box"}
+    picture = render_file(scene_file([entry], lights=[lamp], film=film))
+    direction = np.array([1, 0.3, -0.2]) / np.linalg.norm([1, 0.3, -0.2])
+    cosine = np.maximum(picture[..., 5:8] @ direction, 0)
+    lit = cosine > 0
+    dark = lit & (picture[..., 0] == 0)
+    assert np.abs(picture[..., 0] - cosine).max() < 0.01
+    assert dark.sum() <= 0.002 * lit.sum()
+
+
+def test_near_things_still_throw_shadows(scene_file, render_file):
+    """A card that hovers a thousandth of its size above the ground darkens it."""
+    card = {
+        "plane": {"center": [0, -0.999, 0], "s": [1, 0, 0], "t": [0, 0, -1], "size": [1, 1]},
+        "albedo": [1, 1, 1],
+    }
+    lamp = {"type": "directional", "direction": [0, 1, 0], "irradiance": [1, 1, 1]}
+    below = ABOVE | {"position": [0, -0.9995, 0], "target": [0, -2, 0], "height": 0.5}
+    assert (
+        render_file(scene_file([card, GROUND], camera=below, lights=[lamp]))[..., :3] == 0
+    ).all()
+
+
+@pytest.mark.parametrize(("kind", "radius"), [("box", 0.5), ("tent", 1.0), ("gaussian", 1.5)])
+def test_filter_offsets_follow_the_filter(kind, radius):
+    table = filter_table(kind, radius)
+    assert table[0] == pytest.approx(-radius)
+    assert table[-1] == pytest.approx(radius)
+    np.testing.assert_allclose(table, -table[::-1], atol=1e-9)
+    u = (np.arange(100_000) + 0.5) / 100_000
+    offsets = np.interp(u, np.linspace(0, 1, len(table)), table)
+    x = np.linspace(-radius, radius, 20_001)
+    weight = {
+        "box": np.ones_like(x),
+        "tent": radius - np.abs(x),
+        "gaussian": np.exp(-0.5 * (3 * x / radius) ** 2),
+    }[kind]
+    variance = (weight * x**2).sum() / weight.sum()
+    assert offsets.var() == pytest.approx(variance, rel=0.01)
+
+
+def test_rays_of_a_pixel_are_stratified():
+    assert strata(16) == (4, 4)
+    assert strata(12) == (3, 4)
+    assert strata(7) == (1, 7)
+
+
+def test_background_and_coverage(scene_file, render_file):
+    card = {
+        "plane": {"center": [0, 0, 0], "s": [1, 0, 0], "t": [0, 1, 0], "size": [1.1, 1.1]},
+        "albedo": [1, 1, 1],
+    }
+    film = {"width": 64, "height": 64, "samples": 64, "filter": "box"}
+    plain = render_file(scene_file([card], film=film))
+    assert plain[..., 3].mean() == pytest.approx(0.25, abs=1e-3)
+    np.testing.assert_allclose(plain[..., 0], plain[..., 3], atol=1e-5)  # colour has alpha in it
+    assert (plain[0, 0] == [0, 0, 0, 0, 0, 0, 0, 0, -1, -1]).all()
+    assert plain[32, 32, 4] == pytest.approx(5)
+    np.testing.assert_allclose(plain[32, 32, 5:8], [0, 0, 1], atol=1e-6)
+    behind = render_file(scene_file([card], film=film, background=[0.2, 0.4, 0.6]))
+    assert (behind[..., 3] == 1).all()
+    np.testing.assert_allclose(behind[0, 0, :3], [0.2, 0.4, 0.6], rtol=1e-6)
+    np.testing.assert_allclose(
+        behind[..., :3], plain[..., :3] + (1 - plain[..., 3:4]) * [0.2, 0.4, 0.6], atol=1e-6
+    )
