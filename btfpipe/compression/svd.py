@@ -189,7 +189,7 @@ def compress_svd(
     if not 1 <= n_terms <= most:
         raise InputError(
             f"{n_terms} terms of a sample of {texels} texels and {sample.n_pairs} pairs; expected 1 to {most},"
-            " the lesser of texels and pairs times channels."
+            f" the lesser of texels and pairs times channels. Pass --components {most} or fewer."
         )
     width = min(n_terms + _OVERSAMPLING, most)
     most_passes = (_MOST_ITERATIONS if iterations is None else iterations) + 1
@@ -242,9 +242,10 @@ def compress_svd(
 
 def _require_range(dtype, *factors):
     largest = max(float(np.abs(factor).max()) for factor in factors)
-    if largest > np.finfo(dtype).max:
+    limit = float(np.finfo(dtype).max)
+    if largest > limit:
         raise InputError(
-            f"the factors reach {largest:.3g}, beyond half precision ({np.finfo(dtype).max:.0f});"
+            f"the factors reach {largest:.3g}, beyond half precision ({limit:.0f});"
             " pass --precision single."
         )
 
@@ -255,14 +256,18 @@ class _Passes:
     def __init__(self, sample, width, threads, memory, total, on_progress):
         self.sample, self.total, self.on_progress = sample, total, on_progress
         self.texels = sample.shape[0] * sample.shape[1]
-        self.step = max(1, _DECODED_BYTES // (12 * self.texels))  # pictures decoded at a time
+        # pictures decoded at a time
+        self.step = max(1, _DECODED_BYTES // (12 * self.texels))
+        self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
-        fixed = 4 * width * (4 * self.texels + 3 * sample.n_pairs * 4)
-        each = 4 * width * 2 * self.texels + self.step * self.texels * 3 * 12
+        # basis, its successor and QR's copies; the weights, and in double precision
+        fixed = 4 * width * (4 * self.texels + 12 * sample.n_pairs)
+        # two partial sums; pictures while being decoded
+        each = 4 * width * 2 * self.texels + 36 * self.step * self.texels
         if fixed + each > memory:
             raise InputError(
-                f"{width} vectors of {self.texels} texels need {(fixed + each) / (1 << 20):.0f} MB; --memory"
-                f" allows {memory / (1 << 20):.0f} MB. Raise it, or ask for fewer components."
+                f"{width} vectors of {self.texels} texels need {(fixed + each) / (1 << 20):.1f} MB; --memory"
+                f" allows {memory / (1 << 20):.1f} MB. Raise it, or ask for fewer components."
             )
         self.at_once = int(min((memory - fixed) // each, 2 * threads))
         self.threads = min(threads, self.at_once)

@@ -1,0 +1,143 @@
+"""`btfpipe compress` from the outside."""
+
+import json
+
+import numpy as np
+import pytest
+
+from btfpipe.compression import open_appearance
+from btfpipe.compression.svd import SvdModel, compress_svd
+from btfpipe.sample import Sample
+
+
+@pytest.fixture
+def sample_file(make_sample, tmp_path):
+    path = tmp_path / "s.sample.npz"
+    make_sample(dtype=np.uint8, transfer="srgb", about={"source": "made up"}).save(path)
+    return path
+
+
+def test_the_summary_states_error_bytes_and_ratio(btfpipe, sample_file, tmp_path):
+    out = tmp_path / "m.model.npz"
+    done = btfpipe("compress", sample_file, "-o", out, "--components", 8, "--json")
+    facts = json.loads(done.stdout)
+    assert facts["bytes"] == out.stat().st_size
+    assert facts["sample_bytes"] == 3 * 16 * 20 * 133
+    assert facts["ratio"] == pytest.approx(facts["sample_bytes"] / facts["bytes"])
+    assert facts["n_terms"] == 8
+    assert facts["seed"] == 0
+    model, sample = open_appearance(out), Sample.open(sample_file)
+    assert isinstance(model, SvdModel)
+    everything = slice(0, 133)
+    difference = model.pictures(everything) - sample.pictures(everything)
+    assert facts["rmse"] == pytest.approx(np.sqrt((difference**2).mean()), rel=1e-4)
+    assert model.about["source"] == "made up"
+
+
+def test_precision_decides_the_bytes(btfpipe, sample_file, tmp_path):
+    sizes = {}
+    for precision in ("half", "single"):
+        out = tmp_path / f"{precision}.npz"
+        btfpipe("compress", sample_file, "-o", out, "--precision", precision, "--components", 8)
+        sizes[precision] = out.stat().st_size
+    assert sizes["single"] - sizes["half"] == pytest.approx(2 * 8 * (16 * 20 + 3 * 133), abs=128)
+
+
+def test_same_bytes_for_any_threads_and_other_bytes_for_another_seed(
+    btfpipe, sample_file, tmp_path
+):
+    runs = {"a": ("-t", 1), "b": ("-t", 2), "c": ("-t", 2, "--memory", "1M"), "d": ("--seed", 7)}
+    for name, options in runs.items():
+        btfpipe(
+            "compress",
+            sample_file,
+            "-o",
+            tmp_path / name,
+            "--components",
+            8,
+            "--iterations",
+            0,
+            *options,
+        )
+    data = {name: (tmp_path / name).read_bytes() for name in runs}
+    assert data["a"] == data["b"] == data["c"] != data["d"]
+
+
+def test_a_rank_below_the_components_is_a_warning(btfpipe, make_sample, tmp_path):
+    sample = make_sample()
+    sample.codes[:] = sample.codes[:1]
+    sample.save(tmp_path / "s.npz")
+    done = btfpipe(
+        "compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "--components", 5, "--json"
+    )
+    facts = json.loads(done.stdout)
+    assert facts["n_terms"] == 3
+    assert "2 terms left out" in facts["warnings"][0]
+
+
+def test_one_picture_of_one_view_and_light_compresses(btfpipe, make_sample, tmp_path):
+    from btfpipe.directions import bonn81
+
+    make_sample(lights=bonn81()[:1], views=bonn81()[:1]).save(tmp_path / "s.npz")
+    refused = btfpipe("compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", code=3)
+    assert "expected 1 to 3" in refused.stderr
+    assert "--components 3" in refused.stderr
+    done = btfpipe(
+        "compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "--components", 3, "--json"
+    )
+    assert json.loads(done.stdout)["relative_error"] < 1e-3
+
+
+def bad_sources(make_sample, folder):
+    """Files that cannot be compressed, and what the message says of each."""
+    compress_svd(make_sample(), 3).save(folder / "model.npz")
+    (folder / "text.npz").write_text("no zip at all")
+    whole = make_sample()
+    whole.save(folder / "cut.npz")
+    (folder / "cut.npz").write_bytes((folder / "cut.npz").read_bytes()[:-2000])
+    spoilt = make_sample()
+    spoilt.codes[5, 1, 1, 0] = np.nan
+    spoilt.save(folder / "nan.npz")
+    return {
+        "model.npz": "holds a model",
+        "text.npz": "not a btfpipe file",
+        "cut.npz": "not a btfpipe file, or damaged",
+        "nan.npz": "non-finite",
+    }
+
+
+def test_what_is_no_sample_is_refused_and_nothing_is_written(btfpipe, make_sample, tmp_path):
+    for name, message in bad_sources(make_sample, tmp_path).items():
+        out = tmp_path / "out.npz"
+        done = btfpipe("compress", tmp_path / name, "-o", out, "--components", 4, code=3)
+        assert message in done.stderr, name
+        assert done.stdout == ""
+        assert not list(tmp_path.glob("out.npz*"))
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (("--components", 0), 2, "0 is not in the range"),
+        (("--components", 1000), 3, "1000 terms"),
+        (("--method", "magic"), 2, "magic"),
+        (("--memory", "10K"), 3, "--memory allows"),
+    ],
+)
+def test_impossible_options_are_refused(btfpipe, sample_file, tmp_path, options, code, message):
+    done = btfpipe("compress", sample_file, "-o", tmp_path / "m.npz", *options, code=code)
+    assert message in done.stderr
+    assert not list(tmp_path.glob("m.npz*"))
+
+
+def test_several_samples_are_refused_by_a_method_that_takes_one(btfpipe, sample_file, tmp_path):
+    done = btfpipe("compress", sample_file, sample_file, "-o", tmp_path / "m.npz", code=2)
+    assert "takes one sample; 2 are given" in done.stderr
+
+
+def test_an_existing_model_is_kept_without_force(btfpipe, sample_file, tmp_path):
+    out = tmp_path / "m.npz"
+    out.write_text("mine")
+    done = btfpipe("compress", sample_file, "-o", out, code=2)
+    assert "--force" in done.stderr
+    assert out.read_text() == "mine"
