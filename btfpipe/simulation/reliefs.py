@@ -114,13 +114,20 @@ def cords(t, s, size, rng, *, count, height_mm, width, irregularity, fibres):
     half = width * (1 + 0.35 * irregularity * swell)
     x = np.abs(d) / half
     round_ = np.sqrt(np.clip(1 - x**2.5, 0, None))
-    lift = 1 + 0.35 * irregularity * smooth_noise(rng, (count, 4), own[index], s)
-    strands = smooth_noise(rng, (count * fibres, 4), across / count, s)
-    tufts = smooth_noise(rng, (count * max(fibres // 2, 1), 24), across / count, s)
-    fine = 0.7 * strands + 0.45 * tufts
+    lift = 1 + 0.2 * irregularity * smooth_noise(rng, (count, 4), own[index], s)
+    # strands lie side by side around the cord and slide slowly over its length
+    angle = np.arcsin(np.clip(d / half, -1, 1)) / np.pi + 0.5
+    slide = smooth_noise(rng, (count, 4), own[index], s)
+    strand = angle * fibres + 0.8 * irregularity * slide
+    ridge = np.abs(np.sin(np.pi * strand))
+    tone = smooth_noise(rng, (count * fibres, 6), (index + strand / fibres) / count, s)
+    fuzz = smooth_noise(rng, (count * fibres, 12 * max(count // 3, 1)), across / count, s)
     inside = x < 1
-    height = height_mm * (round_ * lift + (0.07 + 0.13 * round_) * fine)
-    return Relief(height, inside.astype(int), np.where(inside, index + 1, 0), np.clip(fine, -1, 1),
+    height = height_mm * (
+        round_ * lift + 0.16 * round_ * (ridge - 0.6) + (0.03 + 0.05 * round_) * fuzz
+    )
+    fibre = np.clip(0.7 * tone + 0.5 * (ridge - 0.6) + 0.25 * fuzz, -1, 1)
+    return Relief(height, inside.astype(int), np.where(inside, index + 1, 0), fibre,
                   ("groove", "cord"))  # fmt: skip
 
 
@@ -169,7 +176,7 @@ def _threads(across, along, place, over, count, crossings, width, crimp, twist, 
     angle = np.arcsin(x)
     start = rng.uniform(0, 2 * np.pi, count)[index]
     phase = 2 * np.pi * twist * place + 2 * angle + start
-    groove = np.exp(-((np.sin(phase / 2) / 0.3) ** 2)) if twist else np.zeros_like(x)
+    groove = np.exp(-((np.sin(phase / 2) / 0.4) ** 2)) if twist else np.zeros_like(x)
     lengths = smooth_noise(
         rng, (count * 6, 8), (index + 0.5 + 0.5 * angle / np.pi * 2) / count, place
     )
