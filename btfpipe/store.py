@@ -312,6 +312,15 @@ class Reader:
         return _members_digest(self._members.values())
 
 
+def is_ours(path):
+    """Whether a file is a container of the project's (perhaps of a newer version, perhaps damaged)."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _ABOUT in archive.namelist()
+    except (zipfile.BadZipFile, OSError):
+        return False
+
+
 def _expected(kind):
     if kind is None:
         return ""

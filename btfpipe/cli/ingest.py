@@ -1,13 +1,13 @@
 """`btfpipe ingest`: foreign pictures in, a Sample out."""
 
 import re
-import zipfile
 from pathlib import Path
 
 import click
 
 from btfpipe import store
 from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.errors import InputError
 
 
 class Size(click.ParamType):
@@ -132,7 +132,13 @@ def ingest(
 def _open(source, pairs, frontal):
     """The reader for a source: a set of pictures, or one."""
     from btfpipe.formats import pictures, ubo
+    from btfpipe.formats.archive import is_zip
 
-    if source.is_dir() or zipfile.is_zipfile(source) or source.suffix.lower() == ".zip":
+    if not source.is_dir() and store.is_ours(source):
+        raise InputError(
+            f"{source}: already a {store.read(source).kind} of btfpipe's; expected a foreign measurement or a"
+            f" picture. `btfpipe info {source}` describes it."
+        )
+    if source.is_dir() or is_zip(source):
         return ubo.open_measurement(source, pairs=pairs, frontal=frontal)
     return pictures.open_measurement(source)

@@ -15,6 +15,16 @@ _MAX_MEMBER = 2**30  # bytes of one picture, far above any real one
 _MAX_RATIO = 1032  # of deflate: more is a lie
 
 
+def is_zip(path):
+    """Whether a file is a zip, whole or not, or calls itself one."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(4)
+    except OSError:
+        head = b""
+    return head in (b"PK\x03\x04", b"PK\x05\x06") or Path(path).suffix.lower() == ".zip"
+
+
 def open_archive(path):
     """Open a folder or a zip.
 
@@ -35,7 +45,7 @@ def open_archive(path):
 
 
 class Folder:
-    """The files below a folder, hidden ones left out; names are relative, with forward slashes."""
+    """The files below a folder; names are relative, with forward slashes."""
 
     def __init__(self, path):
         self.path = Path(path)

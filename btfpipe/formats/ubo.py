@@ -164,7 +164,7 @@ def open_measurement(path, *, pairs=False, frontal=False):
 
         def read(pair):
             picture = decoder.decode(archive.read(members[pair]), labels[pair])
-            if is_mislabelled(PurePosixPath(members[pair]).name, picture.suffix):
+            if is_mislabelled(members[pair], picture.suffix):
                 mislabelled.append(members[pair])
             return colours(picture, labels[pair])
 

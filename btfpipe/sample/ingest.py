@@ -9,6 +9,7 @@ from btfpipe.sample.sample import Sample
 from btfpipe.sample.transfer import decode, decode_table, encode
 
 _BLOCK_BYTES = 2**22
+_LISTED = 20  # names of strays and the like that a summary lists
 _FULL = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
 
 
@@ -97,25 +98,29 @@ def ingest(
     dtype = first.dtype if first.dtype in (np.uint8, np.float16) else np.dtype(np.float32)
     convert = _converter(first.dtype, dtype, curve, (rows, cols), texels, toroidal)
     table = decode_table(np.uint8, curve) if eight_bit else None
+    full = _FULL.get(first.dtype)
+    same = (
+        eight_bit and (rows, cols) == texels
+    )  # stored as read: one look at the whole block will do
 
     def read_block(block):
         pictures = np.empty((block.stop - block.start, *texels, 3), dtype)
-        clipped = clipped_pictures = 0
+        clipped = []
         for slot, pair in enumerate(range(block.start, block.stop)):
             picture = first if pair == 0 else measurement.read(pair)
             _like_first(picture, first, pair, measurement)
             picture = picture[row : row + rows, col : col + cols]
-            full = _FULL.get(picture.dtype)
-            if full and picture.max() == full:
-                clipped += int((picture == full).any(axis=2).sum())
-                clipped_pictures += 1
+            if full and not same and picture.max() == full:
+                clipped.append(_count_clipped(picture, full))
             pictures[slot] = convert(picture)
+        if full and same and pictures.max() == full:
+            clipped = [_count_clipped(p, full) for p in pictures if p.max() == full]
         total = None
         if flatten:
             total = np.zeros((*texels, 3))
             for picture in pictures:
                 total += table[picture] if eight_bit else picture
-        return pictures, clipped, clipped_pictures, total
+        return pictures, clipped, total
 
     n_pairs = len(measurement.light_index)
     sample = Sample(
@@ -152,12 +157,10 @@ def ingest(
         done = 0
         with writer.stream("pictures", sample.codes.shape, dtype) as put:
             work = blocks(n_pairs, size_of_block)
-            for pictures, clipped, clipped_pictures, total in ordered_map(
-                read_block, work, threads
-            ):
+            for pictures, clipped, total in ordered_map(read_block, work, threads):
                 put(pictures)
-                facts["clipped_pixels"] += clipped
-                facts["clipped_pictures"] += clipped_pictures
+                facts["clipped_pixels"] += sum(clipped)
+                facts["clipped_pictures"] += len(clipped)
                 if flatten:
                     mean += total
                 done += len(pictures)
@@ -166,7 +169,8 @@ def ingest(
             gain = drift_gain(mean / n_pairs)
             writer.array("gain", gain)
             facts["drift"] = float(gain.max() / gain.min() - 1)
-        writer.facts["source"] = facts | _plain_facts(measurement)
+        facts |= _plain_facts(measurement)
+        writer.facts["source"] = facts
     return facts
 
 
@@ -229,6 +233,12 @@ def _converter(source, dtype, curve, shape, texels, toroidal):
         return resized
 
     return convert
+
+
+def _count_clipped(picture, full):
+    """Pixels of which any channel is at the largest code."""
+    at = picture == full
+    return int(np.count_nonzero(at[..., 0] | at[..., 1] | at[..., 2]))
 
 
 def _like_first(picture, first, pair, measurement):
@@ -298,8 +308,11 @@ def _density(measurement, texels_per_mm, shape, texels):
 
 
 def _plain_facts(measurement):
-    """The reader's facts, lists sorted: threads may have filled them in any order."""
-    return {
-        key: sorted(value) if isinstance(value, list) else value
-        for key, value in measurement.facts.items()
-    }
+    """The reader's facts; lists sorted, as threads may have filled them in any order, and cut short."""
+    facts = {}
+    for key, value in measurement.facts.items():
+        if isinstance(value, list):
+            facts[f"n_{key}"] = len(value)
+            value = sorted(value)[:_LISTED]
+        facts[key] = value
+    return facts
