@@ -60,7 +60,8 @@ def stage(out="required"):
     """Give a command the common options, its summary and its exit codes.
 
     The command gets only those common options that its signature names. It returns a dict, the part of the
-    summary that only it knows; ``inputs`` in it may be a list of paths, which are replaced by name and digest.
+    summary that only it knows; ``inputs`` in it may be a list of paths, which are replaced by name and digest,
+    and ``text`` is for a command whose result is to be read: it goes to stdout in place of the summary's sentence.
 
     Parameters
     ----------
@@ -86,6 +87,7 @@ def stage(out="required"):
             try:
                 facts = command(**{k: v for k, v in common.items() if k in takes}, **kwargs)
                 inputs = [_input(path) for path in facts.pop("inputs", [])]
+                text = facts.pop("text", None)
             except BtfError as error:
                 click.echo(f"Error: {error}", err=True)
                 sys.exit(error.exit_code)
@@ -102,6 +104,8 @@ def stage(out="required"):
             }
             if as_json:
                 click.echo(json.dumps(summary, default=store._plain))
+            elif text is not None:
+                click.echo(text)
             elif not quiet:
                 click.echo(_sentence(summary, facts), err=True)
 
