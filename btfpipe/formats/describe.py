@@ -1,0 +1,189 @@
+"""What a foreign file is, and what is wrong with it, in plain values.
+
+A description names everything that is wrong, where `ingest` stops at the first thing.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from btfpipe.directions import from_angles
+from btfpipe.errors import InputError
+from btfpipe.formats.archive import is_zip, open_archive
+from btfpipe.formats.images import Decoder, is_mislabelled, open_picture
+from btfpipe.formats.ubo import Listing
+from btfpipe.parallel import ordered_map
+from btfpipe.sample.describe import describe_directions
+
+_LISTED = 20
+_MESHES = (".obj", ".ply", ".off", ".stl")
+
+
+def describe_foreign(path, threads=1, report=lambda done, total: None):
+    """Describe a folder, zip, picture or mesh, or say that it is unknown.
+
+    Returns
+    -------
+    dict
+        ``kind``, facts, and ``problems``: a list of sentences.
+    """
+    path = Path(path)
+    if path.is_dir() or is_zip(path):
+        try:
+            return _describe_set(path, threads, report)
+        except InputError as error:
+            return {"kind": "folder" if path.is_dir() else "zip", "problems": [str(error)]}
+    if path.suffix.lower() in _MESHES:
+        from btfpipe.formats.meshes import describe_mesh
+
+        return describe_mesh(path)
+    try:
+        picture = open_picture(path)
+    except InputError as error:
+        with path.open("rb") as file:
+            head = file.read(16)
+        return {
+            "kind": "unknown",
+            "bytes": path.stat().st_size,
+            "first_bytes": repr(head)[2:-1],
+            "problems": [str(error)],
+        }
+    return describe_picture(picture, path)
+
+
+def describe_picture(picture, path):
+    """Describe a decoded `Picture`: size, type, and per layer its channels, range and bad values."""
+    values, problems = picture.values, []
+    if is_mislabelled(str(path), picture.suffix):
+        problems.append(f"the name says otherwise, but this is a {picture.suffix[1:]} file.")
+    layers = {}
+    for index, channel in enumerate(picture.channels):
+        layers.setdefault(channel.rpartition(".")[0], []).append(index)
+    described = {}
+    for layer, index in layers.items():
+        part = values[..., index]
+        facts = {"channels": [picture.channels[i].rpartition(".")[2] for i in index]}
+        facts |= _range(part)
+        described[layer or "colour"] = facts
+        if facts["not_finite"]:
+            where = f"layer {layer}: " if layer else ""
+            problems.append(f"{where}{facts['not_finite']} NaN or infinite values.")
+    return {
+        "kind": "picture",
+        "format": picture.suffix[1:],
+        "rows": values.shape[0],
+        "cols": values.shape[1],
+        "stored_as": str(values.dtype),
+        "layers": described,
+        "problems": problems,
+    }
+
+
+def _range(part):
+    """Least, greatest and mean finite value, and counts of clipped and bad values."""
+    if part.dtype.kind != "f":
+        full = np.iinfo(part.dtype).max
+        return {
+            "least": int(part.min()),
+            "greatest": int(part.max()),
+            "mean": float(part.mean()),
+            "clipped": int(np.count_nonzero(part == full)),
+            "not_finite": 0,
+        }
+    good = part[np.isfinite(part)].astype(np.float64)
+    return {
+        "least": float(good.min()) if good.size else None,
+        "greatest": float(good.max()) if good.size else None,
+        "mean": float(good.mean()) if good.size else None,
+        "clipped": 0,
+        "not_finite": int(part.size - good.size),
+    }
+
+
+def _describe_set(path, threads, report):
+    """Describe a folder or zip; decodes every picture of a UBO2003 set."""
+    with open_archive(path) as archive, Decoder() as decoder:
+        listing = Listing(archive)
+        where = "folder" if path.is_dir() else "zip"
+        if not listing.pairs:
+            return {
+                "kind": where,
+                "files": len(archive.names),
+                "problems": [
+                    "holds no pictures with light and view angles in their names, such as"
+                    " '00008 tl000 pl000 tv030 pv030.jpg'."
+                ],
+            }
+
+        def look(name):
+            try:
+                picture = decoder.decode(archive.read(name), name)
+            except InputError as error:
+                return None, str(error), {"not_finite": 0, "clipped": 0}, False
+            key = (picture.values.shape, str(picture.values.dtype), picture.suffix)
+            return key, None, _range(picture.values), is_mislabelled(name, picture.suffix)
+
+        names = list(listing.pairs.values())
+        kinds, unreadable, mislabelled, not_finite = {}, [], [], []
+        clipped = clipped_pictures = 0
+        looks = ordered_map(look, names, threads, ahead=8 * threads)
+        for done, (name, found) in enumerate(zip(names, looks, strict=True), 1):
+            key, error, facts, wrong = found
+            if error:
+                unreadable.append(error)
+                continue
+            kinds.setdefault(key, []).append(name)
+            clipped += facts["clipped"]
+            clipped_pictures += facts["clipped"] > 0
+            if facts["not_finite"]:
+                not_finite.append(f"{name}: {facts['not_finite']} NaN or infinite values.")
+            if wrong:
+                mislabelled.append(name)
+            report(done, len(names))
+        missing = listing.missing()
+        problems = [
+            *_listed("pictures cannot be read", unreadable),
+            *_listed("view/light pairs are missing", [_pair(*pair) for pair in missing]),
+            *_listed("pairs are there twice", [f"{a!r} and {b!r}" for a, b in listing.duplicates]),
+            *_listed("pictures hold values that are not finite", not_finite),
+            *_listed("pictures are mislabelled", mislabelled),
+        ]
+        if len(kinds) > 1:
+            sizes = [
+                f"{len(names)} of {shape[0]} x {shape[1]} {dtype} {suffix[1:]} (first {names[0]!r})"
+                for (shape, dtype, suffix), names in kinds.items()
+            ]
+            problems.append("pictures differ: " + "; ".join(sizes) + ".")
+        (shape, dtype, suffix) = max(kinds, key=lambda key: len(kinds[key]), default=((), "", ""))
+        return {
+            "kind": "UBO2003 set",
+            "packed_as": where,
+            "rows": shape[0] if shape else None,
+            "cols": shape[1] if shape else None,
+            "stored_as": dtype,
+            "format": suffix[1:],
+            "pairs": len(names),
+            "views": describe_directions(from_angles(*np.radians(np.array(listing.views).T))),
+            "lights": describe_directions(from_angles(*np.radians(np.array(listing.lights).T))),
+            "product": not missing,
+            "missing_pairs": len(missing),
+            "duplicate_pairs": len(listing.duplicates),
+            "clipped_values": clipped,
+            "clipped_pictures": clipped_pictures,
+            "other_files": len(listing.strays),
+            "ignored": listing.strays[:_LISTED],
+            "settings": listing.settings,
+            "problems": problems,
+        }
+
+
+def _pair(view, light):
+    return f"tl{light[0]:g} pl{light[1]:g} tv{view[0]:g} pv{view[1]:g}"
+
+
+def _listed(what, things):
+    """One problem that lists the first few things, or none."""
+    if not things:
+        return []
+    more = ", ..." if len(things) > _LISTED else ""
+    return [f"{len(things)} {what}: {', '.join(things[:_LISTED])}{more}"]

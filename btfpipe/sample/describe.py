@@ -1,0 +1,147 @@
+"""What a container of the project's is, and what is wrong with it, in plain values."""
+
+import numpy as np
+
+from btfpipe.directions import bonn81, to_angles, ubo2014
+from btfpipe.errors import InputError
+from btfpipe.parallel import blocks
+from btfpipe.sample.sample import Sample
+
+_BLOCK_VALUES = 2**22
+_LISTED = 20
+
+
+def describe_container(reader, report=lambda done, total: None):
+    """Describe any of the project's files.
+
+    Parameters
+    ----------
+    reader : store.Reader
+    report : callable
+        ``report(done, total)`` while values are read.
+
+    Returns
+    -------
+    dict
+        ``kind``, ``digest``, ``about``, ``arrays`` (name to shape, type and number of values that are not finite), for
+        a sample also ``sample``, and ``problems``: a list of sentences.
+    """
+    problems, arrays = [], {}
+    for name in reader.names():
+        try:
+            array = reader[name]
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        arrays[name] = {"shape": list(array.shape), "dtype": str(array.dtype)}
+        if array.dtype.kind == "f":
+            bad = _not_finite(array, report)
+            arrays[name]["not_finite"] = bad
+            if bad:
+                problems.append(f"{name} holds {bad} NaN or infinite values.")
+    description = {"kind": reader.kind, "digest": reader.digest}
+    if reader.kind == "sample" and not problems:
+        try:
+            sample = Sample.from_reader(reader)
+        except InputError as error:
+            problems.append(str(error))
+        except KeyError as error:
+            problems.append(f"{reader.path}: its description lacks {error}.")
+        else:
+            description["sample"] = describe_sample(sample, report)
+            problems += description["sample"].pop("problems")
+    return description | {"about": reader.about, "arrays": arrays, "problems": problems}
+
+
+def _not_finite(array, report):
+    flat = array.reshape(-1)
+    bad = 0
+    for block in blocks(flat.size, _BLOCK_VALUES):
+        values = flat[block]
+        bad += values.size - int(np.count_nonzero(np.isfinite(values)))
+        report(block.stop, flat.size)
+    return bad
+
+
+def describe_sample(sample, report=lambda done, total: None):
+    """Describe a Sample: sizes, directions, pairs, clipped values, scale.
+
+    Returns
+    -------
+    dict
+        With ``problems``, a list of sentences.
+    """
+    pairs = list(zip(sample.view_index.tolist(), sample.light_index.tolist(), strict=True))
+    seen = set(pairs)
+    n_views, n_lights = len(sample.view_directions), len(sample.light_directions)
+    missing = [(v, n) for v in range(n_views) for n in range(n_lights) if (v, n) not in seen]
+    clipped = _clipped(sample, report)
+    description = {
+        "rows": sample.shape[0],
+        "cols": sample.shape[1],
+        "pairs": sample.n_pairs,
+        "views": describe_directions(sample.view_directions),
+        "lights": describe_directions(sample.light_directions),
+        "product": sample.is_product,
+        "missing_pairs": len(missing),
+        "duplicate_pairs": len(pairs) - len(seen),
+        "clipped_values": clipped,
+        "clipped_share": clipped / sample.codes.size,
+        "stored_as": str(sample.codes.dtype),
+        "transfer": sample.transfer,
+        "scale": sample.scale,
+        "absolute_scale": "known" if sample.absolute else "unknown",
+        "toroidal": sample.toroidal,
+        "texels_per_mm": sample.texels_per_mm,
+        "flattened": sample.gain is not None,
+        "nbytes": sample.nbytes,
+        "problems": [],
+    }
+    if missing and not sample.is_product:
+        names = ", ".join(f"view {v} light {n}" for v, n in missing[:_LISTED])
+        description["problems"].append(
+            f"{len(missing)} of {n_views * n_lights} view/light pairs are missing ({names}"
+            f"{', ...' if len(missing) > _LISTED else ''})."
+        )
+    if len(pairs) > len(seen):
+        description["problems"].append(f"{len(pairs) - len(seen)} pairs are there twice.")
+    for name, table in (("view", sample.view_directions), ("light", sample.light_directions)):
+        length = np.linalg.norm(table, axis=1)
+        if abs(length - 1).max() > 1e-4 or table[:, 2].min() < -1e-6:
+            description["problems"].append(
+                f"{name} directions are not all unit vectors above the surface."
+            )
+    return description
+
+
+def describe_directions(directions):
+    """Number, rings and name of a set of directions (n, 3)."""
+    theta, _ = to_angles(directions)
+    rings, counts = np.unique(np.round(np.degrees(theta), 2), return_counts=True)
+    known = {"Bonn's 81": bonn81(), "UBO2014's 151": ubo2014()}
+    return {
+        "number": len(directions),
+        "set": next(
+            (
+                name
+                for name, table in known.items()
+                if table.shape == directions.shape and np.allclose(table, directions, atol=1e-4)
+            ),
+            None,
+        ),
+        "rings_deg": {f"{ring:g}": int(count) for ring, count in zip(rings, counts, strict=True)}
+        if len(rings) <= _LISTED
+        else f"{len(rings)} polar angles from {rings[0]:g} to {rings[-1]:g}",
+    }
+
+
+def _clipped(sample, report):
+    """Values at the largest code of 8-bit pictures."""
+    if sample.codes.dtype != np.uint8:
+        return 0
+    flat = sample.codes.reshape(-1)
+    clipped = 0
+    for block in blocks(flat.size, 4 * _BLOCK_VALUES):
+        clipped += int(np.count_nonzero(flat[block] == 255))
+        report(block.stop, flat.size)
+    return clipped
