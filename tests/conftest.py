@@ -64,3 +64,52 @@ def make_sample():
         return Sample(codes, lights, views, pair % n_lights, pair // n_lights, **kwargs)
 
     return make
+
+
+@pytest.fixture
+def make_measurement(tmp_path):
+    """Write a tiny set in Bonn's layout as a zip or folder.
+
+    Returns its path and the codes (views, lights, rows, cols, 3). ``change(members)`` may spoil the dict of
+    names and bytes before it is packed.
+    """
+    import zipfile
+
+    from btfpipe.formats.images import encode_picture
+    from btfpipe.formats.ubo import pair_name
+
+    def make(
+        name="set.zip",
+        lights=((0, 0), (30, 0), (30, 90)),
+        views=((0, 0), (45, 180)),
+        shape=(6, 8),
+        suffix=".png",
+        dtype=np.uint8,
+        seed=1,
+        change=None,
+    ):
+        rng = np.random.default_rng(seed)
+        size = (len(views), len(lights), *shape, 3)
+        if np.dtype(dtype).kind == "f":
+            codes = (rng.random(size) * 4).astype(dtype)
+        else:
+            codes = rng.integers(0, np.iinfo(dtype).max, size, dtype)
+        members = {
+            pair_name(len(views) * n + v, light, view, suffix): encode_picture(codes[v, n], suffix)
+            for v, view in enumerate(views)
+            for n, light in enumerate(lights)
+        }
+        if change is not None:
+            change(members)
+        path = tmp_path / name
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(path, "w") as archive:
+                for member, data in members.items():
+                    archive.writestr(member, data)
+        else:
+            for member, data in members.items():
+                (path / member).parent.mkdir(parents=True, exist_ok=True)
+                (path / member).write_bytes(data)
+        return path, codes
+
+    return make
