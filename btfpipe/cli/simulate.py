@@ -1,6 +1,6 @@
 """`btfpipe simulate`: a specification in, a measurement in Bonn's layout out."""
 
-from pathlib import Path
+from types import SimpleNamespace
 
 import click
 
@@ -46,6 +46,7 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
         btfpipe simulate data-sample/weave.yaml --directions truth.csv --format exr -o truth.zip
     """
     from btfpipe.formats.images import encode_picture, read_picture
+    from btfpipe.formats.obj_parts import read_parts
     from btfpipe.formats.ubo_writing import create_measurement
     from btfpipe.simulation import campaign, materials
     from btfpipe.simulation.goniometer import Goniometer
@@ -53,7 +54,11 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
 
     wanted = read_spec(spec)
     lights, views, index = plan(wanted, pairs)
-    patch = materials.build_patch(wanted, lambda name: read_picture(Path(spec).parent / name))
+    files = SimpleNamespace(
+        picture=lambda name: read_picture(spec.parent / name),
+        mesh=lambda name: read_parts(spec.parent / name),
+    )
+    patch = materials.build_patch(wanted, files)
     goniometer = Goniometer(
         patch, wanted["samples"], **wanted["inter_reflection"], seed=seed, threads=threads
     )
@@ -68,7 +73,7 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
     settings = display.settings | {
         "toroidal": True,
         "texels_per_mm": wanted["texels_per_mm"],
-        "title": wanted.get("title", Path(spec).stem),
+        "title": wanted.get("title", spec.stem),
     }
     with create_measurement(out, settings) as put, progress("pictures", quiet) as report:
         captured = campaign.capture(

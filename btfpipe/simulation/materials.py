@@ -4,22 +4,25 @@ import numpy as np
 
 from btfpipe.errors import InputError
 from btfpipe.sample.transfer import decode
+from btfpipe.simulation.meshes import MESHES
 from btfpipe.simulation.noise import fractal_noise
-from btfpipe.simulation.patch import height_field
+from btfpipe.simulation.patch import Patch, height_field
 from btfpipe.simulation.reliefs import RELIEFS, Relief
+from btfpipe.simulation.tiles import TileMesh, smooth_corners
 
 _GREY = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear Rec. 709
 
 
-def build_patch(spec, read_file):
+def build_patch(spec, files):
     """Make the Patch of a specification.
 
     Parameters
     ----------
     spec : dict
         Of `read_spec`.
-    read_file : callable
-        Returns the picture (rows, cols, channels) of a file that the specification names.
+    files : object
+        Reads what the specification names: ``picture(name)`` returns (rows, cols, channels), ``mesh(name)`` returns
+        vertices (n, 3), faces (m, 3), part (m,) and the parts' names.
 
     Raises
     ------
@@ -31,33 +34,63 @@ def build_patch(spec, read_file):
     scale = spec["texels_per_mm"]
     size = (rows / scale, cols / scale)
     rng = np.random.default_rng([spec["seed"], 0])
-    if kind in MESHES:
-        return MESHES[kind](spec, read_file, size, rng, parameters)
     fine = spec["vertices_per_texel"]
+    if kind == "obj":
+        return _tiled(spec, files, *_read_mesh(files, **parameters), size)
+    if kind in MESHES:
+        return _tiled(
+            spec, files, MESHES[kind](size, 2 / (fine * scale), rng, **parameters), 180, size
+        )
     t, s = np.meshgrid(
         np.arange(rows * fine) / (rows * fine),
         np.arange(cols * fine) / (cols * fine),
         indexing="ij",
     )
     if kind == "picture":
-        relief = _pictured(t, s, read_file, **parameters)
+        relief = _pictured(t, s, files, **parameters)
     else:
         relief = RELIEFS[kind](t, s, size, rng, **parameters)
-    albedo, roughness, f0 = painted(spec, read_file, relief, t, s, size)
+    albedo, roughness, f0 = painted(spec, files, relief, t, s, size)
     return height_field(relief.height * scale, albedo, roughness, f0, (rows, cols))
 
 
-def _pictured(t, s, read_file, *, file, height_mm):
-    grey = _read(read_file, file)
+def _read_mesh(files, *, file, crease_deg):
+    vertices, faces, part, names = files.mesh(file)
+    flat = np.zeros(len(vertices), int)
+    return TileMesh(vertices, faces, part, flat, flat, names), crease_deg
+
+
+def _tiled(spec, files, mesh, crease_deg, size):
+    """Patch of a TileMesh: corners with one normal and one material share a row of the tables."""
+    group, normals = smooth_corners(mesh, size, crease_deg)
+    # a vertex for each (vertex, group) pair that occurs
+    pairs, corner = np.unique(
+        np.stack([mesh.faces.ravel(), group.ravel()], axis=1), axis=0, return_inverse=True
+    )
+    faces = corner.reshape(-1, 3)
+    part, first = np.zeros(len(normals), int), np.zeros(len(normals), int)
+    part[group.ravel()] = np.repeat(mesh.part, 3)
+    first[pairs[::-1, 1]] = pairs[::-1, 0]
+    places = mesh.vertices[first]
+    t, s = places[:, 1] / size[0] % 1, places[:, 0] / size[1] % 1
+    relief = Relief(places[:, 2], part, mesh.element[first], mesh.fibre[first], mesh.parts)
+    return Patch(
+        tuple(spec["texels"]), mesh.vertices[pairs[:, 0]] * spec["texels_per_mm"], faces, pairs[:, 1],
+        normals, *painted(spec, files, relief, t, s, size),
+    )  # fmt: skip
+
+
+def _pictured(t, s, files, *, file, height_mm):
+    grey = _read(files, file)
     grey = grey[..., 0] if grey.shape[-1] < 3 else grey[..., :3] @ _GREY
     height = height_mm * _look_up(grey[..., None], t, s)[..., 0]
     flat = np.zeros(t.shape, int)
     return Relief(height, flat, flat, np.zeros(t.shape), ("surface",))
 
 
-def _read(read_file, file):
+def _read(files, file):
     """A picture as floats, integers scaled to [0, 1]."""
-    picture = read_file(file)
+    picture = files.picture(file)
     top = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1
     return picture / np.float64(top)
 
@@ -77,7 +110,7 @@ def _look_up(picture, t, s):
     )
 
 
-def painted(spec, read_file, relief, t, s, size):
+def painted(spec, files, relief, t, s, size):
     """Albedo (..., 3), roughness (...) and f0 (..., 3) over places (t, s) with a Relief's parts."""
     parts = spec["parts"]
     ((kind, _),) = spec["structure"].items()
@@ -90,12 +123,12 @@ def painted(spec, read_file, relief, t, s, size):
         rng = np.random.default_rng([spec["seed"], 1, index])
         cells = tuple(max(round(length / material["mottle_mm"]), 2) for length in size)
         mottle = fractal_noise(rng, cells, t[at], s[at])
-        colour = _colour(material["albedo"], read_file, relief.element[at], t[at], s[at], rng)
+        colour = _colour(material["albedo"], files, relief.element[at], t[at], s[at], rng)
         change = (1 + material["mottle"] * mottle) * (1 + material["streaks"] * relief.fibre[at])
         albedo[at] = np.clip(colour * change[:, None], 0, 1)
-        rough = _value(material["roughness"], read_file, t[at], s[at])
+        rough = _value(material["roughness"], files, t[at], s[at])
         roughness[at] = np.clip(rough.mean(axis=-1), 0.05, 1)
-        f0[at] = np.clip(_value(material["f0"], read_file, t[at], s[at]), 0, 1)
+        f0[at] = np.clip(_value(material["f0"], files, t[at], s[at]), 0, 1)
     return albedo, roughness, f0
 
 
@@ -113,9 +146,9 @@ def _match(kind, expected, given):
             )
 
 
-def _colour(albedo, read_file, element, t, s, rng):
+def _colour(albedo, files, element, t, s, rng):
     if isinstance(albedo, dict):
-        picture = _read(read_file, albedo["picture"])[..., :3]
+        picture = _read(files, albedo["picture"])[..., :3]
         return _look_up(decode(picture, "srgb"), t, s) + np.zeros(3)
     if isinstance(albedo, str) or not isinstance(albedo[0], str | list):
         return _linear(albedo) + np.zeros((len(t), 1))
@@ -134,13 +167,10 @@ def _linear(colour):
     return np.array(colour, float)
 
 
-def _value(thing, read_file, t, s):
+def _value(thing, files, t, s):
     """A number, a triple or a picture as linear values (n, 3)."""
     if isinstance(thing, dict):
-        picture = _read(read_file, thing["picture"])
+        picture = _read(files, thing["picture"])
         picture = picture[..., :3] if picture.shape[-1] >= 3 else picture[..., :1]
         return _look_up(picture, t, s) + np.zeros(3)
     return np.asarray(thing, float) + np.zeros((len(t), 3))
-
-
-MESHES = {}
