@@ -252,6 +252,8 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
         spec.attribute("jpeg:subsampling", "4:4:4")
     if suffix == ".exr":
         spec.attribute("compression", "zip")
+    else:
+        spec.attribute("oiio:UnassociatedAlpha", 1)  # or the library divides colours by alpha
     # no DateTime or Software: equal pictures are equal bytes
     for key in ("DateTime", "Software"):
         spec.erase_attribute(key)

@@ -122,7 +122,7 @@ def ingest(
                 total += table[picture] if eight_bit else picture
         return pictures, clipped, total
 
-    n_pairs = len(measurement.light_index)
+    n_pairs = measurement.n_pairs
     sample = Sample(
         np.broadcast_to(np.zeros(1, dtype), (n_pairs, *texels, 3)),
         measurement.light_directions,

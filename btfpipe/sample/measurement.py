@@ -46,3 +46,7 @@ class Measurement:
     toroidal: bool | None = None
     texels_per_mm: float | None = None
     facts: dict = field(default_factory=dict)
+
+    @property
+    def n_pairs(self):
+        return len(self.light_index)
