@@ -10,8 +10,15 @@ neighbourhood that lies inside is compared.
 """
 
 import numpy as np
-from numba import njit
 
+from btfpipe.analysis.neighbour_kernels import (
+    Windows,
+    all_pairs,
+    coarse_texel,
+    exhaustive_lists,
+    pair_distances,
+    seeded_lists,
+)
 from btfpipe.analysis.pyramid import check_pyramid, halve, plain_level
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -19,15 +26,9 @@ from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 EXHAUSTIVE_TEXELS = 64 * 64
 SEEDS = 100
 _ROWS = 4  # rows a task
+_TABLE_VECTORS = 1024  # plain features beyond this many are compared vector by vector: their table would leave the cache
 
-
-@njit(cache=True, inline="always")
-def coarse_texel(row):
-    """Row (or col) of the next coarser level's texel that stands for this one.
-
-    The texel nearest to (row + 0.5) / 2 - 0.5, which never lies half-way: ``row // 2``.
-    """
-    return row >> 1
+__all__ = ["add_neighbour_lists", "coarse_texel", "inside_range", "neighbourhood_distances"]
 
 
 def inside_range(size, coarse_size, neighbourhood, coarse_neighbourhood, toroidal):
@@ -121,7 +122,7 @@ def neighbourhood_distances(features, level, texels, others):
     features : Features
     level : int
     texels, others : (n,) int
-        Texels as ``row * cols + col``.
+        Texels as ``row * cols + col``; the neighbourhoods of `others` must lie inside the sample.
 
     Returns
     -------
@@ -134,77 +135,71 @@ def neighbourhood_distances(features, level, texels, others):
     )  # fmt: skip
     texels, others = (np.ascontiguousarray(a, np.int32) for a in (texels, others))
     out = np.zeros(len(texels), np.float32)
-    _distances(*search.tables, texels, others, out)
+    pair_distances(search.fine, search.coarse, texels, others, out)
     return out
 
 
 class _Search:
-    """What both searches need of a level and its coarser one."""
+    """A level and its coarser one, made ready for both searches."""
 
     def __init__(self, level, coarse, side, coarse_side, toroidal, clamped=False):
-        self.rows, self.cols = level.shape
-        coarse_rows, coarse_cols = coarse.shape if coarse else (0, 0)
-        self.coarse_cols = coarse_cols
+        self.shape = level.shape
+        coarse_shape = coarse.shape if coarse else (0, 0)
         everywhere = toroidal or clamped
-        self.row_range = inside_range(self.rows, coarse_rows, side, coarse_side, everywhere)
-        self.col_range = inside_range(self.cols, coarse_cols, side, coarse_side, everywhere)
+        self.bounds = [
+            bound
+            for size, coarse_size in zip(self.shape, coarse_shape, strict=True)
+            for bound in inside_range(size, coarse_size, side, coarse_side, everywhere)
+        ]
         mode = "wrap" if toroidal else "edge" if clamped else "constant"
-        fine = _padded(level, side, mode)
-        if coarse:
-            self.tables = (*fine, side, *_padded(coarse, coarse_side, mode), coarse_side)
-        else:
-            self.tables = (*fine, side, fine[0][:0], fine[1][:0, :0], fine[2][:0], 0)
+        self.fine = _windows(level, side, mode)
+        self.coarse = _windows(coarse, coarse_side, mode) if coarse else _NOTHING
+        self.coarse_shape = coarse_shape
+        self.levels = (level, coarse)
 
     def __len__(self):
         """How many texels lists may name."""
-        spans = [max(0, high - low) for low, high in (self.row_range, self.col_range)]
-        return spans[0] * spans[1]
+        top, bottom, left, right = self.bounds
+        return max(0, bottom - top) * max(0, right - left)
 
     def lists(self, k, parents, threads):
         """Lists (rows, cols, k), from the children of `parents` (rows / 2, cols / 2, seeds) if given."""
+        out = np.empty((*self.shape, k), np.int32)
+        bounds = np.array(self.bounds)
         if parents is None:
-            return self.exhaustive(k, threads)
-        return self.seeded(parents, k, threads)
-
-    def exhaustive(self, k, threads):
-        padded, table, vectors, side, coarse_padded, coarse_table, coarse_vectors, coarse_side = (
-            self.tables
-        )
-        if not len(table):
-            table = _distance_table(vectors)
-        pairs = np.zeros((1, 1), np.float32)
-        if coarse_side:
-            if not len(coarse_table):
-                coarse_table = _distance_table(coarse_vectors)
-            n = len(coarse_padded) - coarse_side + 1
-            pairs = np.empty((n * self.coarse_cols, n * self.coarse_cols), np.float32)
-
-            def fill(rows):
-                _all_pairs(coarse_padded, coarse_table, coarse_side, rows.start, rows.stop, pairs)
-
-            list(ordered_map(fill, blocks(n, _ROWS), threads))
-        out = np.empty((self.rows, self.cols, k), np.int32)
-
-        def search(rows):
-            _exhaustive(
-                padded, table, side, pairs, self.coarse_cols, *self.row_range, *self.col_range,
-                rows.start, rows.stop, out,
-            )  # fmt: skip
-
-        list(ordered_map(search, blocks(self.rows, _ROWS), threads))
-        return out
-
-    def seeded(self, seeds, k, threads):
-        seeds = np.ascontiguousarray(seeds)
-        out = np.empty((self.rows, self.cols, k), np.int32)
-
-        def search(rows):
-            _seeded(
-                *self.tables, seeds, *self.row_range, *self.col_range, rows.start, rows.stop, out
+            fine, coarse = (
+                windows
+                if len(windows.table) or not windows.side
+                else windows._replace(table=_distance_table(level))
+                for windows, level in zip((self.fine, self.coarse), self.levels, strict=True)
             )
+            pairs = self._coarse_pairs(coarse, threads)
 
-        list(ordered_map(search, blocks(self.rows, _ROWS), threads))
+            def search(rows):
+                exhaustive_lists(
+                    fine, pairs, self.coarse_shape[1], bounds, rows.start, rows.stop, out
+                )
+        else:
+            parents = np.ascontiguousarray(parents)
+
+            def search(rows):
+                seeded_lists(self.fine, self.coarse, parents, bounds, rows.start, rows.stop, out)
+
+        list(ordered_map(search, blocks(self.shape[0], _ROWS), threads))
         return out
+
+    def _coarse_pairs(self, coarse, threads):
+        """Neighbourhood distances (n, n) of the coarser level's texels; (1, 1) if there is none."""
+        rows, cols = self.coarse_shape
+        if not rows:
+            return np.zeros((1, 1), np.float32)
+        pairs = np.empty((rows * cols, rows * cols), np.float32)
+
+        def fill(part):
+            all_pairs(coarse, part.start, part.stop, pairs)
+
+        list(ordered_map(fill, blocks(rows, _ROWS), threads))
+        return pairs
 
 
 def _low_pass(level, toroidal):
@@ -214,35 +209,34 @@ def _low_pass(level, toroidal):
     return plain_level(halve(np.pad(image, (*odd, (0, 0)), "edge"), toroidal))
 
 
-def _padded(level, side, mode):
-    """Labels with half a neighbourhood around them, the distance table, and the vectors.
-
-    In mode ``constant`` the label outside is the default's, whose distance to everything is set to 0: such
-    places do not count. The table is empty where it would not pay (plain features of a large sample).
-    """
+def _windows(level, side, mode):
+    """A level padded by half a neighbourhood, in a mode of `numpy.pad`; ``constant`` means that places outside do not count."""
     margin = side // 2
     default = len(level.vectors) - 1
     outside = {"constant_values": default} if mode == "constant" else {}
-    padded = np.pad(level.labels, margin, mode, **outside)
-    if level.gram is not None:
-        gram = np.asarray(level.gram, np.float64)
-        square = np.diagonal(gram)
-        table = np.maximum(square[:, None] + square[None] - 2 * gram, 0).astype(np.float32)
-        table[default] = 0
-        table[:, default] = 0
-        vectors = np.zeros((1, 1), np.float32)
+    labels = np.ascontiguousarray(np.pad(level.labels, margin, mode, **outside), np.int32)
+    table = image = np.zeros((0, 0), np.float32)
+    if level.gram is not None or default <= _TABLE_VECTORS:
+        table = _distance_table(level)
     else:
-        vectors = np.ascontiguousarray(level.vectors, np.float32)
-        table = _distance_table(vectors) if default <= 1024 else np.zeros((0, 0), np.float32)
-    return np.ascontiguousarray(padded, np.int32), table, vectors
+        image = np.ascontiguousarray(level.vectors[labels], np.float32).reshape(len(labels), -1)
+    return Windows(labels, table, image, side, mode == "constant")
 
 
-def _distance_table(vectors):
-    """Squared distances (n + 1, n + 1) of vectors; 0 for the default, the last one."""
-    vectors = np.asarray(vectors, np.float64)
-    vectors = vectors - vectors[-1]
-    with single_threaded_blas():
-        table = vectors @ vectors.T
+_NOTHING = Windows(
+    np.zeros((0, 0), np.int32), np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), 0, False
+)
+
+
+def _distance_table(level):
+    """Squared distances (n + 1, n + 1) float32 of a level's vectors; 0 for the default, the last one."""
+    if level.gram is not None:
+        table = np.array(level.gram, np.float64)
+    else:
+        vectors = np.asarray(level.vectors, np.float64)
+        vectors = vectors - vectors[-1]
+        with single_threaded_blas():
+            table = vectors @ vectors.T
     square = np.diagonal(table).copy()
     table *= -2
     table += square[:, None]
@@ -251,173 +245,3 @@ def _distance_table(vectors):
     table[-1] = 0
     table[:, -1] = 0
     return table.astype(np.float32)
-
-
-@njit(cache=True, nogil=True)
-def _offer(distance, texel, distances, texels):
-    """Insert into a sorted list if it belongs there; ties go to the lower texel."""
-    last = distances.shape[0] - 1
-    if distance > distances[last] or (distance == distances[last] and texel > texels[last]):
-        return
-    i = last
-    while i > 0 and (
-        distances[i - 1] > distance or (distances[i - 1] == distance and texels[i - 1] > texel)
-    ):
-        distances[i] = distances[i - 1]
-        texels[i] = texels[i - 1]
-        i -= 1
-    distances[i] = distance
-    texels[i] = texel
-
-
-@njit(cache=True, nogil=True)
-def _columns(padded, table, side, r, s, sums):
-    """Distances of padded columns c and e of the rows about r and s, summed over `side` rows: sums[c, e]."""
-    width = padded.shape[1]
-    for c in range(width):
-        for e in range(width):
-            sums[c, e] = 0.0
-        for o in range(side):
-            line = table[padded[r + o, c]]
-            other = padded[s + o]
-            for e in range(width):
-                sums[c, e] += line[other[e]]
-
-
-@njit(cache=True, nogil=True)
-def _diagonal(sums, side, c, out):
-    """Sums along the diagonal, the neighbourhood's columns, for texel c against all others of a row."""
-    for e in range(out.shape[0]):
-        out[e] = sums[c, e]
-    for o in range(1, side):
-        for e in range(out.shape[0]):
-            out[e] += sums[c + o, e + o]
-
-
-@njit(cache=True, nogil=True)
-def _all_pairs(padded, table, side, first, last, pairs):
-    """Neighbourhood distances of the texels of rows first to last with all texels."""
-    cols = padded.shape[1] - side + 1
-    rows = padded.shape[0] - side + 1
-    sums = np.empty((padded.shape[1], padded.shape[1]), np.float32)
-    for r in range(first, last):
-        for s in range(rows):
-            _columns(padded, table, side, r, s, sums)
-            for c in range(cols):
-                _diagonal(sums, side, c, pairs[r * cols + c, s * cols : (s + 1) * cols])
-
-
-@njit(cache=True, nogil=True)
-def _exhaustive(
-    padded, table, side, coarse_pairs, coarse_cols, row_low, row_high, col_low, col_high, first, last, out
-):  # fmt: skip
-    """Lists of the texels of rows first to last, out of all texels inside."""
-    cols = padded.shape[1] - side + 1
-    k = out.shape[2] - 1
-    sums = np.empty((padded.shape[1], padded.shape[1]), np.float32)
-    line = np.empty(cols, np.float32)
-    distances = np.empty((cols, k + 1), np.float32)
-    texels = np.empty((cols, k + 1), np.int32)
-    for r in range(first, last):
-        distances[:] = np.inf
-        texels[:] = 2**31 - 1
-        for s in range(row_low, row_high):
-            _columns(padded, table, side, r, s, sums)
-            for c in range(cols):
-                _diagonal(sums, side, c, line)
-                if coarse_cols > 0:
-                    start = coarse_texel(s) * coarse_cols
-                    coarse = coarse_pairs[coarse_texel(r) * coarse_cols + coarse_texel(c)]
-                    for e in range(cols):
-                        line[e] += coarse[start + coarse_texel(e)]
-                for e in range(col_low, col_high):
-                    if line[e] <= distances[c, k]:
-                        if s * cols + e != r * cols + c:
-                            _offer(line[e], np.int32(s * cols + e), distances[c], texels[c])
-        for c in range(cols):
-            out[r, c, 0] = r * cols + c
-            for i in range(k):
-                out[r, c, i + 1] = texels[c, i]
-
-
-@njit(cache=True, nogil=True)
-def _texel_distance(table, vectors, a, b):
-    """Squared distance of two labels, from the table or else from the vectors."""
-    if table.shape[0] > 0:
-        return table[a, b]
-    default = vectors.shape[0] - 1
-    total = np.float32(0.0)
-    if a != default and b != default:
-        for i in range(vectors.shape[1]):
-            step = vectors[a, i] - vectors[b, i]
-            total += step * step
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _square_distance(padded, table, vectors, side, r, c, s, e, start, limit):
-    """`start` plus the distance of the squares about (r, c) and (s, e), given up row by row above `limit`."""
-    total = start
-    for i in range(side):
-        for j in range(side):
-            total += _texel_distance(table, vectors, padded[r + i, c + j], padded[s + i, e + j])
-        if total > limit:
-            break
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _distances(
-    padded, table, vectors, side, coarse_padded, coarse_table, coarse_vectors, coarse_side, texels, others, out
-):  # fmt: skip
-    """Neighbourhood distances of pairs of texels."""
-    cols = padded.shape[1] - side + 1
-    for i in range(texels.shape[0]):
-        r, c = texels[i] // cols, texels[i] % cols
-        s, e = others[i] // cols, others[i] % cols
-        start = np.float32(0.0)
-        start = _square_distance(
-            coarse_padded, coarse_table, coarse_vectors, coarse_side,
-            coarse_texel(r), coarse_texel(c), coarse_texel(s), coarse_texel(e), start, np.inf,
-        )  # fmt: skip
-        out[i] = _square_distance(padded, table, vectors, side, r, c, s, e, start, np.inf)
-
-
-@njit(cache=True, nogil=True)
-def _seeded(
-    padded, table, vectors, side, coarse_padded, coarse_table, coarse_vectors, coarse_side,
-    seeds, row_low, row_high, col_low, col_high, first, last, out,
-):  # fmt: skip
-    """Lists of the texels of rows first to last, out of the children of their parents' seeds."""
-    cols = padded.shape[1] - side + 1
-    seed_cols = seeds.shape[1]
-    k = out.shape[2] - 1
-    distances = np.empty(k + 1, np.float32)
-    texels = np.empty(k + 1, np.int32)
-    for r in range(first, last):
-        for c in range(cols):
-            distances[:] = np.inf
-            texels[:] = 2**31 - 1
-            parent = seeds[coarse_texel(r), coarse_texel(c)]
-            for i in range(parent.shape[0]):
-                seed_row, seed_col = parent[i] // seed_cols, parent[i] % seed_cols
-                start = np.float32(0.0)
-                start = _square_distance(
-                    coarse_padded, coarse_table, coarse_vectors, coarse_side,
-                    coarse_texel(r), coarse_texel(c), seed_row, seed_col, start, distances[k],
-                )  # fmt: skip
-                for child in range(4):
-                    s = 2 * seed_row + child // 2
-                    e = 2 * seed_col + child % 2
-                    if s < row_low or s >= row_high or e < col_low or e >= col_high:
-                        continue
-                    if s == r and e == c:
-                        continue
-                    distance = _square_distance(
-                        padded, table, vectors, side, r, c, s, e, start, distances[k]
-                    )
-                    if distance <= distances[k]:
-                        _offer(distance, np.int32(s * cols + e), distances, texels)
-            out[r, c, 0] = r * cols + c
-            for i in range(k):  # too few seeds near a border: repeat the last one found
-                out[r, c, i + 1] = texels[i] if distances[i] < np.inf else out[r, c, i]
