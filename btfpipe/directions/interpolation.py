@@ -12,12 +12,21 @@ from numba import njit
 
 from btfpipe.errors import InputError
 
-# What a compiled kernel needs of a Hemisphere. Angles of the hull's edges and triangles are in the stereographic plane.
+# What a compiled kernel needs of a Hemisphere; all in the stereographic plane but `vectors`.
+#   vectors      (n, 3)      the directions
+#   points       (n, 2)      their projections
+#   triangles    (m, 3)      corners
+#   neighbours   (m, 3)      triangle across the edge that faces each corner, -1 outside
+#   inverse      (m, 6)      origin x, y (the first corner), and the matrix that gives the two other weights
+#   edges        (k, 2)      of the hull
+#   start        (g, g)      triangle under the middle of each cell of a grid over [-1, 1]^2, or near it
+#   first, near  (g*g+1,), (*,)  directions that can be among the nearest five of a point in each cell of the grid
+#   mode         0 barycentric, else the number of nearest directions
 HemisphereTables = namedtuple(
-    "HemisphereTables", "vectors points triangles neighbours edges start nearest_four"
+    "HemisphereTables", "vectors points triangles neighbours inverse edges start first near mode"
 )
 
-_GRID = 64
+_GRID = 128
 _EPSILON = 1e-9
 
 
@@ -56,19 +65,15 @@ class Hemisphere:
         self.method = method
         points = vectors[:, :2] / (1 + vectors[:, 2:])
         triangles, neighbours, edges = _triangulate(points)
-        start = np.zeros((_GRID, _GRID), np.int32)
-        if len(triangles):
-            # the triangle whose centre is nearest to the cell's is a good place to start walking from
-            centres = points[triangles].mean(axis=1)
-            cell = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
-            x, y = np.meshgrid(cell, cell, indexing="ij")
-            grid = np.stack([x.ravel(), y.ravel()], axis=1)
-            distance = ((grid[:, None] - centres[None]) ** 2).sum(axis=2)
-            start = distance.argmin(axis=1).astype(np.int32).reshape(_GRID, _GRID)
         mode = {"barycentric": 0, "four": 4, "nearest": 1}[method]
+        cell = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
+        grid = np.stack(np.meshgrid(cell, cell, indexing="ij"), axis=-1).reshape(-1, 2)
+        start = _nearest_triangle(points, triangles, grid)
+        first, near = _candidates(vectors, grid) if mode else (np.zeros(1, np.int32),) * 2
         self.tables = HemisphereTables(
-            vectors, points, triangles, neighbours, edges, start, np.int32(mode)
-        )
+            vectors, points, triangles, neighbours, _inverses(points, triangles), edges, start,
+            first, near, np.int32(mode),
+        )  # fmt: skip
 
     def weights(self, directions):
         """Indices (m, 4) and weights (m, 4), summing to 1, for query directions (m, 3)."""
@@ -101,7 +106,45 @@ def _triangulate(points):
     return none, none, np.ascontiguousarray(np.stack([order[:-1], order[1:]], axis=1))
 
 
-@njit(cache=True, nogil=True)
+def _inverses(points, triangles):
+    """First corner and inverse of the edges' matrix of each triangle, (m, 6)."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    u, v = b - a, c - a
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])[:, None]
+    rows = np.concatenate([v[:, 1:], -v[:, :1], -u[:, 1:], u[:, :1]], axis=1)
+    return np.ascontiguousarray(np.concatenate([a, rows / area], axis=1))
+
+
+def _nearest_triangle(points, triangles, grid):
+    """For each cell of the grid the triangle whose centre is nearest: walks start there."""
+    from scipy.spatial import cKDTree
+
+    if len(triangles) == 0:
+        return np.zeros((_GRID, _GRID), np.int32)
+    start = cKDTree(points[triangles].mean(axis=1)).query(grid)[1]
+    return np.ascontiguousarray(start.reshape(_GRID, _GRID), np.int32)
+
+
+def _candidates(vectors, grid):
+    """For each cell the directions that can be among the five nearest of any point in it, as (first, near).
+
+    A chord is at most twice as long as its projection, so no point of a cell is farther than `reach` from the
+    cell's middle, and no chord changes by more than that across it.
+    """
+    from scipy.spatial import cKDTree
+
+    reach = 2 * np.sqrt(2) / _GRID
+    squared = (grid**2).sum(axis=1, keepdims=True)
+    middle = np.concatenate([2 * grid, 1 - squared], axis=1) / (1 + squared)
+    tree = cKDTree(vectors)
+    count = min(5, len(vectors))
+    fifth = tree.query(middle, k=[count])[0][:, 0]
+    lists = tree.query_ball_point(middle, fifth + 2 * reach + 1e-9, return_sorted=True)
+    first = np.concatenate([[0], np.cumsum([len(a) for a in lists])]).astype(np.int32)
+    return first, np.concatenate(lists).astype(np.int32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def find(tables, x, y, z, index, weight):
     """Weights of direction (x, y, z) over the measured ones.
 
@@ -123,29 +166,33 @@ def find(tables, x, y, z, index, weight):
         x /= length
         y /= length
         z = 0.0
-    if tables.nearest_four > 0:
-        return _nearest(tables.vectors, x, y, z, tables.nearest_four, index, weight)
     px = x / (1.0 + z)
     py = y / (1.0 + z)
+    i = min(max(int((px + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
+    j = min(max(int((py + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
+    if tables.mode > 0:
+        return _nearest(
+            tables.vectors,
+            tables.first,
+            tables.near,
+            i * _GRID + j,
+            x,
+            y,
+            z,
+            tables.mode,
+            index,
+            weight,
+        )
     points = tables.points
     triangles = tables.triangles
+    inverse = tables.inverse
     if triangles.shape[0] > 0:
-        i = min(max(int((px + 1.0) * 0.5 * _GRID), 0), _GRID - 1)
-        j = min(max(int((py + 1.0) * 0.5 * _GRID), 0), _GRID - 1)
         triangle = tables.start[i, j]
         for _ in range(triangles.shape[0]):
-            a = triangles[triangle, 0]
-            b = triangles[triangle, 1]
-            c = triangles[triangle, 2]
-            ux = points[b, 0] - points[a, 0]
-            uy = points[b, 1] - points[a, 1]
-            vx = points[c, 0] - points[a, 0]
-            vy = points[c, 1] - points[a, 1]
-            qx = px - points[a, 0]
-            qy = py - points[a, 1]
-            area = ux * vy - uy * vx
-            wb = (qx * vy - qy * vx) / area
-            wc = (ux * qy - uy * qx) / area
+            qx = px - inverse[triangle, 0]
+            qy = py - inverse[triangle, 1]
+            wb = inverse[triangle, 2] * qx + inverse[triangle, 3] * qy
+            wc = inverse[triangle, 4] * qx + inverse[triangle, 5] * qy
             wa = 1.0 - wb - wc
             least = 0
             low = wa
@@ -156,9 +203,9 @@ def find(tables, x, y, z, index, weight):
                 least = 2
                 low = wc
             if low >= -_EPSILON:
-                index[0] = a
-                index[1] = b
-                index[2] = c
+                index[0] = triangles[triangle, 0]
+                index[1] = triangles[triangle, 1]
+                index[2] = triangles[triangle, 2]
                 weight[0] = wa
                 weight[1] = wb
                 weight[2] = wc
@@ -192,42 +239,43 @@ def find(tables, x, y, z, index, weight):
     return 3
 
 
-@njit(cache=True, nogil=True)
-def _nearest(vectors, x, y, z, count, index, weight):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(vectors, first, near, cell, x, y, z, count, index, weight):
     """The nearest directions; weights fall to zero at the distance of the next one (Shepard, Franke-Little)."""
     n = vectors.shape[0]
     used = min(count, n)
-    distance = np.full(5, np.inf)
-    order = np.zeros(5, np.int32)
-    for k in range(n):
+    for k in range(used):
+        weight[k] = np.inf
+    beyond = np.inf  # distance of the nearest one that is left out
+    for at in range(first[cell], first[cell + 1]):
+        k = near[at]
         dx = vectors[k, 0] - x
         dy = vectors[k, 1] - y
         dz = vectors[k, 2] - z
-        chord = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if chord < distance[used]:
-            place = used
-            while place > 0 and distance[place - 1] > chord:
-                distance[place] = distance[place - 1]
-                order[place] = order[place - 1]
+        chord = dx * dx + dy * dy + dz * dz
+        if chord < weight[used - 1]:
+            beyond = weight[used - 1]
+            place = used - 1
+            while place > 0 and weight[place - 1] > chord:
+                weight[place] = weight[place - 1]
+                index[place] = index[place - 1]
                 place -= 1
-            distance[place] = chord
-            order[place] = k
+            weight[place] = chord
+            index[place] = k
+        elif chord < beyond:
+            beyond = chord
     if used == 1:
-        index[0] = order[0]
         weight[0] = 1.0
         return 1
-    radius = distance[used] if n > used else 2.0
+    radius = np.sqrt(beyond) if n > used else 2.0
     total = 0.0
+    if weight[0] < 1e-18:
+        weight[0] = 1.0
+        for k in range(1, used):
+            weight[k] = 0.0
+        return used
     for k in range(used):
-        index[k] = order[k]
-        if distance[k] < 1e-9:
-            for other in range(used):
-                weight[other] = 0.0
-            weight[k] = 1.0
-            for other in range(k + 1, used):
-                index[other] = order[other]
-            return used
-        w = (1.0 / distance[k] - 1.0 / radius) ** 2
+        w = (1.0 / np.sqrt(weight[k]) - 1.0 / radius) ** 2
         weight[k] = w
         total += w
     if total <= 0.0:

@@ -9,8 +9,10 @@ from numba.extending import overload
 from btfpipe.directions import Hemisphere
 from btfpipe.directions.interpolation import find
 from btfpipe.errors import InputError
+from btfpipe.parallel import blocks
 from btfpipe.sample.appearance import light_cosines
 
+_QUERIES = 8192  # whose pairs are listed at a time
 _BLOCK = 64  # texels whose pairs are gathered together: a line of the cache is then read once
 
 
@@ -34,12 +36,9 @@ class RawShader:
     """
 
     def __init__(self, sample, interpolation="barycentric"):
-        sample.require_product("shading")
+        self.pairs = PairWeights(sample, interpolation)
         self.rows, self.cols = sample.shape
         self.toroidal = sample.toroidal
-        self.lights = Hemisphere(sample.light_directions, interpolation).tables
-        self.views = Hemisphere(sample.view_directions, interpolation).tables
-        self.inverse_cosines = 1 / light_cosines(sample.light_directions)
         self.codes = texel_major(sample)
         self.table = _table(sample)
         self.gain = np.zeros((0, 3), np.float32)
@@ -48,10 +47,11 @@ class RawShader:
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
-        _shade(
-            self.codes, self.table, self.gain, self.rows, self.cols, self.toroidal,
-            self.lights, self.inverse_cosines, self.views, row, col, w_i, w_o, out,
-        )  # fmt: skip
+        for part, pair, share in self.pairs.blocks(w_i, w_o):
+            _shade(
+                self.codes, self.table, self.gain, self.rows, self.cols, self.toroidal,
+                row[part], col[part], pair, share, out[part],
+            )  # fmt: skip
 
 
 def texel_major(sample):
@@ -120,44 +120,80 @@ def _overload_value(table, code):
     return lambda table, code: table[0] * code
 
 
-@njit(cache=True, nogil=True)
-def pair_weights(lights, inverse_cosines, views, w_i, w_o, index, weight, pair, share):
-    """Pairs and weights that stand for one light and view of a product.
+class PairWeights:
+    """Finds the pairs of a product that stand for lights and views between the measured ones.
+
+    Parameters
+    ----------
+    appearance : Appearance
+        A product of views and lights.
+    interpolation : str
+        ``barycentric``, ``four`` or ``nearest``.
+    """
+
+    def __init__(self, appearance, interpolation):
+        appearance.require_product("shading")
+        self.lights = Hemisphere(appearance.light_directions, interpolation).tables
+        self.views = Hemisphere(appearance.view_directions, interpolation).tables
+        self.inverse_cosines = 1 / light_cosines(appearance.light_directions)
+        self.most = {"barycentric": 9, "four": 16, "nearest": 1}[interpolation]
+
+    def blocks(self, w_i, w_o):
+        """Yield (slice, pair, share) over the queries; arrays as `find_pairs` fills them.
+
+        Blocks keep the lists in the processor's cache between the two kernels. Two kernels, since one that
+        finds and blends in the same loop spends a third of its time counting references to the tables.
+        """
+        for part in blocks(len(w_i), _QUERIES):
+            n = part.stop - part.start
+            pair = np.empty((n, self.most), np.int32)
+            share = np.empty((n, self.most), np.float32)
+            find_pairs(
+                self.lights, self.inverse_cosines, self.views, w_i[part], w_o[part], pair, share
+            )
+            yield part, pair, share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_pairs(lights, inverse_cosines, views, w_i, w_o, pair, share):
+    """Pairs and weights that stand for each light and view.
 
     Parameters
     ----------
     lights, views : HemisphereTables
     inverse_cosines : (lights,) float64
         Between lights, value / cos(theta_i) is interpolated and multiplied by the true cosine.
-    w_i, w_o : (3,) float32
+    w_i, w_o : (n, 3) float32
         Unit vectors in the sample's frame.
-    index, weight : (2, 4) int32, (2, 4) float64
-        Scratch.
-    pair, share : (16,) int32, (16,) float32
-        Filled in place; entries of weight 0 are left out.
-
-    Returns
-    -------
-    int
-        How many entries are used; 0 for a light below the horizon.
+    pair : (n, most) int32
+        Filled in place.
+    share : (n, most) float32
+        Filled in place; all 0 for a light below the horizon.
     """
-    cosine = w_i[2]
-    if cosine <= 0.0:
-        return 0
-    n_lights = find(lights, w_i[0], w_i[1], cosine, index[0], weight[0])
-    n_views = find(views, w_o[0], w_o[1], w_o[2], index[1], weight[1])
-    count = lights.vectors.shape[0]
-    for i in range(n_lights):
-        weight[0, i] *= cosine * inverse_cosines[index[0, i]]
-    used = 0
-    for o in range(n_views):
+    light = np.zeros(4, np.int32)
+    view = np.zeros(4, np.int32)
+    by_light = np.zeros(4)
+    by_view = np.zeros(4)
+    count = len(inverse_cosines)
+    for q in range(len(w_i)):
+        cosine = w_i[q, 2]
+        if cosine <= 0.0:
+            pair[q] = 0
+            share[q] = 0.0
+            continue
+        n_lights = find(lights, w_i[q, 0], w_i[q, 1], cosine, light, by_light)
+        n_views = find(views, w_o[q, 0], w_o[q, 1], w_o[q, 2], view, by_view)
         for i in range(n_lights):
-            w = weight[1, o] * weight[0, i]
-            if w != 0.0:
-                pair[used] = index[1, o] * count + index[0, i]
-                share[used] = w
+            by_light[i] *= cosine * inverse_cosines[light[i]]
+        used = 0
+        for o in range(n_views):
+            for i in range(n_lights):
+                pair[q, used] = view[o] * count + light[i]
+                share[q, used] = by_view[o] * by_light[i]
                 used += 1
-    return used
+        for k in range(used, pair.shape[1]):
+            pair[q, k] = pair[q, 0]
+            share[q, k] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -187,58 +223,35 @@ def corners(row, col, rows, cols, toroidal, texel, share):
     share[3] = y * x
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _shade(
-    codes,
-    table,
-    gain,
-    rows,
-    cols,
-    toroidal,
-    lights,
-    inverse_cosines,
-    views,
-    row,
-    col,
-    w_i,
-    w_o,
-    out,
-):
-    index = np.zeros((2, 4), np.int32)
-    weight = np.zeros((2, 4))
-    pair = np.zeros(16, np.int32)
-    share = np.zeros(16, np.float32)
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _shade(codes, table, gain, rows, cols, toroidal, row, col, pair, share, out):
     texel = np.zeros(4, np.int64)
     bilinear = np.zeros(4, np.float32)
     for q in range(len(row)):
-        used = pair_weights(
-            lights, inverse_cosines, views, w_i[q], w_o[q], index, weight, pair, share
-        )
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
         red = np.float32(0)
         green = np.float32(0)
         blue = np.float32(0)
-        if used > 0:
-            for k in range(4):
-                if bilinear[k] == 0.0:
-                    continue
-                r = np.float32(0)
-                g = np.float32(0)
-                b = np.float32(0)
-                line = codes[texel[k]]
-                for p in range(used):
-                    at = 3 * pair[p]
-                    w = share[p]
-                    r += w * _value(table, line[at])
-                    g += w * _value(table, line[at + 1])
-                    b += w * _value(table, line[at + 2])
-                if len(gain) > 0:
-                    r *= gain[texel[k], 0]
-                    g *= gain[texel[k], 1]
-                    b *= gain[texel[k], 2]
-                red += bilinear[k] * r
-                green += bilinear[k] * g
-                blue += bilinear[k] * b
+        for k in range(4):
+            if bilinear[k] == 0.0:
+                continue
+            r = np.float32(0)
+            g = np.float32(0)
+            b = np.float32(0)
+            i = texel[k]
+            for p in range(pair.shape[1]):
+                at = 3 * np.int64(pair[q, p])
+                w = share[q, p]
+                r += w * _value(table, codes[i, at])
+                g += w * _value(table, codes[i, at + 1])
+                b += w * _value(table, codes[i, at + 2])
+            if len(gain) > 0:
+                r *= gain[i, 0]
+                g *= gain[i, 1]
+                b *= gain[i, 2]
+            red += bilinear[k] * r
+            green += bilinear[k] * g
+            blue += bilinear[k] * b
         out[q, 0] = red
         out[q, 1] = green
         out[q, 2] = blue
