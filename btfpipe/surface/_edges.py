@@ -1,0 +1,500 @@
+"""Compiled edits of a triangle mesh: split, collapse and flip of edges.
+
+The mesh is a table of half-edges. Half-edge ``3 f + k`` leaves corner k of face f, whose vertex is
+``corner[3 f + k]``, towards the next corner; ``opposite`` is the same edge seen from the other face,
+or -1 on a boundary. ``leave[v]`` is a half-edge that leaves vertex v, the boundary one if v lies on a
+boundary, so that turning counter-clockwise from it meets every face of v. Dead faces have
+``corner[3 f] = -1``, dead vertices ``leave[v] = -1``.
+
+``feature`` marks the half-edges of boundaries and creases; ``kind`` says whether a vertex moves freely (0), along its two
+feature edges (1), or not at all (2). All three edits keep the mesh a manifold of the same genus.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+_DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
+_RING = 96  # vertices of more neighbours than this are left alone
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _next(h):
+    return h + 1 if h % 3 < 2 else h - 2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _previous(h):
+    return h - 1 if h % 3 > 0 else h + 2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _join(opposite, feature, h, g, mark):
+    """Make h and g the two sides of one edge; either may be -1."""
+    if h >= 0:
+        opposite[h] = g
+        feature[h] = 1 if g < 0 else mark
+    if g >= 0:
+        opposite[g] = h
+        feature[g] = 1 if h < 0 else mark
+
+
+@njit(cache=True, nogil=True)
+def _settle(opposite, leave, v, h):
+    """Set leave[v] from any half-edge h that leaves v, turning clockwise to the boundary if there is one."""
+    start = h
+    while True:
+        g = opposite[h]
+        if g < 0:
+            break
+        h = _next(g)
+        if h == start:
+            break
+    leave[v] = h
+
+
+@njit(cache=True, nogil=True)
+def _ring(corner, opposite, leave, v, out, around):
+    """Half-edges leaving v, counter-clockwise, and the neighbours of v; their counts, or -1 if there are too many."""
+    h = leave[v]
+    n = 0
+    while True:
+        if n >= _RING - 1:
+            return -1, -1
+        out[n] = h
+        around[n] = corner[_next(h)]
+        n += 1
+        p = _previous(h)
+        g = opposite[p]
+        if g < 0:
+            around[n] = corner[p]
+            return n, n + 1
+        if g == leave[v]:
+            return n, n
+        h = g
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _length2(points, a, b):
+    return (
+        (points[a, 0] - points[b, 0]) ** 2
+        + (points[a, 1] - points[b, 1]) ** 2
+        + (points[a, 2] - points[b, 2]) ** 2
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cross(ax, ay, az, bx, by, bz, cx, cy, cz):
+    """Twice the area vector of the triangle a, b, c."""
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    vx, vy, vz = cx - ax, cy - ay, cz - az
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@njit(cache=True, nogil=True)
+def _longest_beside(corner, opposite, points, h):
+    """Squared length of the longest other edge of the faces at h."""
+    longest = 0.0
+    for i in range(2):
+        g = h if i == 0 else opposite[h]
+        if g >= 0:
+            c = corner[_previous(g)]
+            longest = max(longest, _length2(points, c, corner[g]))
+            longest = max(longest, _length2(points, c, corner[_next(g)]))
+    return longest
+
+
+@njit(cache=True, nogil=True)
+def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces, longest):
+    """Halve edges longer than `longest`, repeatedly, each when it is the longest of its faces.
+
+    Stops early when the arrays are full. Returns the new numbers of vertices and faces and
+    whether it finished.
+    """
+    limit = longest * longest
+    changed = True
+    while changed:
+        changed = False
+        h = -1
+        while h + 1 < 3 * n_faces:
+            h += 1
+            if corner[h - h % 3] < 0 or opposite[h] > h:
+                continue
+            a, b = corner[h], corner[_next(h)]
+            length = _length2(points, a, b)
+            if length <= limit or length < _longest_beside(corner, opposite, points, h):
+                continue
+            if n_vertices + 1 > len(points) or 3 * (n_faces + 2) > len(corner):
+                return n_vertices, n_faces, False
+            changed = True
+            g = opposite[h]
+            mark = feature[h]
+            m = n_vertices
+            n_vertices += 1
+            for axis in range(3):
+                points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
+                flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
+            kind[m] = 1 if mark else 0
+            # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
+            f = 3 * n_faces
+            n_faces += 1
+            h1 = _next(h)
+            c = corner[_previous(h)]
+            outer, outer_mark = opposite[h1], feature[h1]
+            corner[h1] = m
+            corner[f], corner[f + 1], corner[f + 2] = m, b, c
+            _join(opposite, feature, f + 1, outer, outer_mark)
+            _join(opposite, feature, f + 2, h1, 0)
+            if g < 0:
+                _join(opposite, feature, f, -1, 1)
+                _join(opposite, feature, h, -1, 1)
+                leave[m] = f
+            else:
+                # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
+                e = 3 * n_faces
+                n_faces += 1
+                g1 = _next(g)
+                d = corner[_previous(g)]
+                outer, outer_mark = opposite[g1], feature[g1]
+                corner[g1] = m
+                corner[e], corner[e + 1], corner[e + 2] = m, a, d
+                _join(opposite, feature, e + 1, outer, outer_mark)
+                _join(opposite, feature, e + 2, g1, 0)
+                _join(opposite, feature, e, h, mark)
+                _join(opposite, feature, f, g, mark)
+                leave[m] = f
+                if g >= 0 and leave[a] == g1:
+                    leave[a] = e + 1
+            if leave[b] == h1:
+                leave[b] = f + 1
+    return n_vertices, n_faces, True
+
+
+@njit(cache=True, nogil=True)
+def _folds(corner, points, out, n, skip1, skip2, x, y, z):
+    """Whether moving the vertex that the half-edges `out` leave to (x, y, z) turns a face over."""
+    for i in range(n):
+        h = out[i]
+        if h // 3 == skip1 or h // 3 == skip2:
+            continue
+        a, b, c = corner[h], corner[_next(h)], corner[_previous(h)]
+        ox, oy, oz = _cross(
+            points[a, 0], points[a, 1], points[a, 2],
+            points[b, 0], points[b, 1], points[b, 2],
+            points[c, 0], points[c, 1], points[c, 2],
+        )  # fmt: skip
+        nx, ny, nz = _cross(
+            x, y, z,
+            points[b, 0], points[b, 1], points[b, 2],
+            points[c, 0], points[c, 1], points[c, 2],
+        )  # fmt: skip
+        old = np.sqrt(ox * ox + oy * oy + oz * oz)
+        new = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if ox * nx + oy * ny + oz * nz < 0.2 * old * new:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def collapse_short(
+    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest
+):
+    """Collapse edges shorter than `shortest` where nothing folds, tears or gets longer than `longest`.
+
+    Returns the number of collapses. Features are shortened only along themselves, and a component
+    or a hole never vanishes (link condition).
+    """
+    out_a, out_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    near_a, near_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    limit, bound = shortest * shortest, longest * longest
+    done = 0
+    for start in range(3 * n_faces):
+        if corner[start - start % 3] < 0 or opposite[start] > start:
+            continue
+        for side in range(2):
+            h, g = start, opposite[start]
+            if side == 1:
+                if g < 0:
+                    break
+                h, g = g, h
+            a, b = corner[h], corner[_next(h)]
+            if _length2(points, a, b) >= limit:
+                break
+            if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
+                continue
+            h1, h2 = _next(h), _previous(h)
+            if kind[a] == 1 and feature[h2]:
+                continue
+            boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
+            if boundary_a and boundary_b and g >= 0:
+                continue
+            faces_a, n_a = _ring(corner, opposite, leave, a, out_a, near_a)
+            faces_b, n_b = _ring(corner, opposite, leave, b, out_b, near_b)
+            if n_a < 0 or n_b < 0:
+                continue
+            common = 0
+            for i in range(n_a):
+                for j in range(n_b):
+                    common += near_a[i] == near_b[j]
+            if common != (1 if g < 0 else 2):
+                continue
+            outer1, outer2 = opposite[h1], opposite[h2]
+            if outer1 < 0 and outer2 < 0:
+                continue
+            if not _may_lose(corner, opposite, leave, corner[h2]):
+                continue
+            inner1, inner2 = -1, -1
+            if g >= 0:
+                g1, g2 = _next(g), _previous(g)
+                inner1, inner2 = opposite[g1], opposite[g2]
+                if inner1 < 0 and inner2 < 0:
+                    continue
+                if kind[a] == 1 and feature[g1]:
+                    continue
+                if not _may_lose(corner, opposite, leave, corner[g2]):
+                    continue
+            both = kind[a] == 0 and kind[b] == 0
+            share = 0.5 if both else 0.0
+            x = points[b, 0] + share * (points[a, 0] - points[b, 0])
+            y = points[b, 1] + share * (points[a, 1] - points[b, 1])
+            z = points[b, 2] + share * (points[a, 2] - points[b, 2])
+            stretched = False
+            for i in range(n_a + n_b if both else n_a):
+                v = near_a[i] if i < n_a else near_b[i - n_a]
+                if (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2 > bound:
+                    stretched = True
+                    break
+            f0 = h // 3
+            f1 = g // 3 if g >= 0 else -1
+            if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z):
+                continue
+            if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z):
+                continue
+            points[b, 0], points[b, 1], points[b, 2] = x, y, z
+            for axis in range(3):
+                flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
+            c = corner[h2]
+            d = corner[_previous(g)] if g >= 0 else -1
+            mark = feature[h1] | feature[h2]
+            inner_mark = feature[_next(g)] | feature[_previous(g)] if g >= 0 else 0
+            for i in range(faces_a):
+                corner[out_a[i]] = b
+            corner[3 * f0] = -1
+            _join(opposite, feature, outer1, outer2, mark)
+            if g >= 0:
+                corner[3 * f1] = -1
+                _join(opposite, feature, inner1, inner2, inner_mark)
+            leave[a] = -1
+            _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
+            _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
+            if g >= 0:
+                _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
+            done += 1
+            break
+    return done
+
+
+@njit(cache=True, nogil=True)
+def _may_lose(corner, opposite, leave, v):
+    """Whether v keeps a proper neighbourhood when one of its edges goes: three faces inside, one on a boundary."""
+    if opposite[leave[v]] < 0:
+        return True
+    h = leave[v]
+    n = 0
+    while n < 4:
+        n += 1
+        h = opposite[_previous(h)]
+        if h == leave[v]:
+            break
+    return n > 3
+
+
+@njit(cache=True, nogil=True)
+def _degree(opposite, leave, v):
+    """Number of edges at v, and 6 or 4, the number an even mesh has there."""
+    h = leave[v]
+    n = 0
+    while n < 1000:
+        n += 1
+        h = opposite[_previous(h)]
+        if h < 0:
+            return n + 1, 4
+        if h == leave[v]:
+            break
+    return n, 6
+
+
+@njit(cache=True, nogil=True)
+def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
+    """Flip edges towards even degrees (`by_degree`) or towards Delaunay triangles; returns the number of flips."""
+    done = 0
+    for h in range(3 * n_faces):
+        g = opposite[h]
+        if corner[h - h % 3] < 0 or g < h or feature[h]:
+            continue
+        h1, h2 = _next(h), _previous(h)
+        g1, g2 = _next(g), _previous(g)
+        a, b, c, d = corner[h], corner[h1], corner[h2], corner[g2]
+        if by_degree:
+            na, ia = _degree(opposite, leave, a)
+            nb, ib = _degree(opposite, leave, b)
+            nc, ic = _degree(opposite, leave, c)
+            nd, idd = _degree(opposite, leave, d)
+            before = (na - ia) ** 2 + (nb - ib) ** 2 + (nc - ic) ** 2 + (nd - idd) ** 2
+            after = (
+                (na - 1 - ia) ** 2 + (nb - 1 - ib) ** 2 + (nc + 1 - ic) ** 2 + (nd + 1 - idd) ** 2
+            )
+            if after >= before:
+                continue
+        elif _cotangent(points, c, a, b) + _cotangent(points, d, a, b) > -1e-6:
+            continue
+        if _adjacent(corner, opposite, leave, c, d):
+            continue
+        ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
+        bx, by, bz = points[b, 0], points[b, 1], points[b, 2]
+        cx, cy, cz = points[c, 0], points[c, 1], points[c, 2]
+        dx, dy, dz = points[d, 0], points[d, 1], points[d, 2]
+        px, py, pz = _cross(ax, ay, az, bx, by, bz, cx, cy, cz)
+        qx, qy, qz = _cross(bx, by, bz, ax, ay, az, dx, dy, dz)
+        ux, uy, uz = _cross(ax, ay, az, dx, dy, dz, cx, cy, cz)
+        vx, vy, vz = _cross(dx, dy, dz, bx, by, bz, cx, cy, cz)
+        sx, sy, sz = px + qx, py + qy, pz + qz
+        size = np.sqrt(sx * sx + sy * sy + sz * sz)
+        if (
+            ux * sx + uy * sy + uz * sz <= 0.3 * size * np.sqrt(ux * ux + uy * uy + uz * uz)
+            or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz)
+        ):
+            continue
+        o_bc, m_bc = opposite[h1], feature[h1]
+        o_ca, m_ca = opposite[h2], feature[h2]
+        o_ad, m_ad = opposite[g1], feature[g1]
+        o_db, m_db = opposite[g2], feature[g2]
+        i, j = h - h % 3, g - g % 3
+        corner[i], corner[i + 1], corner[i + 2] = a, d, c
+        corner[j], corner[j + 1], corner[j + 2] = d, b, c
+        _join(opposite, feature, i, o_ad, m_ad)
+        _join(opposite, feature, i + 2, o_ca, m_ca)
+        _join(opposite, feature, j, o_db, m_db)
+        _join(opposite, feature, j + 1, o_bc, m_bc)
+        _join(opposite, feature, i + 1, j + 2, 0)
+        _settle(opposite, leave, a, i)
+        _settle(opposite, leave, b, j + 1)
+        _settle(opposite, leave, c, i + 2)
+        _settle(opposite, leave, d, j)
+        done += 1
+    return done
+
+
+@njit(cache=True, nogil=True)
+def _adjacent(corner, opposite, leave, a, b):
+    h = leave[a]
+    for _ in range(1000):
+        if corner[_next(h)] == b:
+            return True
+        p = _previous(h)
+        if opposite[p] < 0:
+            return corner[p] == b
+        h = opposite[p]
+        if h == leave[a]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _cotangent(points, v, a, b):
+    """Cotangent of the angle at v in the triangle v, a, b."""
+    ux, uy, uz = points[a, 0] - points[v, 0], points[a, 1] - points[v, 1], points[a, 2] - points[v, 2]
+    wx, wy, wz = points[b, 0] - points[v, 0], points[b, 1] - points[v, 1], points[b, 2] - points[v, 2]
+    cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    area = np.sqrt(cx * cx + cy * cy + cz * cz)
+    return (ux * wx + uy * wy + uz * wz) / max(area, 1e-300)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
+    """Fill `step` with each vertex's move towards the middle of its neighbours, within the tangent plane.
+
+    Neighbours are weighted by the areas around the edge to them, so that crowded vertices spread.
+    Vertices of kind 1 move towards the middle of their two feature neighbours, those of kind 2 stay.
+    """
+    for v in prange(n_vertices):
+        step[v, 0] = step[v, 1] = step[v, 2] = 0.0
+        h = leave[v]
+        if h < 0 or kind[v] == 2:
+            continue
+        x, y, z = points[v, 0], points[v, 1], points[v, 2]
+        nx = ny = nz = cx = cy = cz = total = 0.0
+        while True:
+            b, c = corner[_next(h)], corner[_previous(h)]
+            if kind[v] == 1:
+                if feature[h]:
+                    cx += points[b, 0]
+                    cy += points[b, 1]
+                    cz += points[b, 2]
+                    total += 1.0
+            else:
+                ex, ey, ez = _cross(
+                    x, y, z,
+                    points[b, 0], points[b, 1], points[b, 2],
+                    points[c, 0], points[c, 1], points[c, 2],
+                )  # fmt: skip
+                nx += ex
+                ny += ey
+                nz += ez
+                area = np.sqrt(ex * ex + ey * ey + ez * ez)
+                total += 2.0 * area
+                cx += area * (points[b, 0] + points[c, 0])
+                cy += area * (points[b, 1] + points[c, 1])
+                cz += area * (points[b, 2] + points[c, 2])
+            p = _previous(h)
+            h = opposite[p]
+            if h < 0:
+                if kind[v] == 1:
+                    b = corner[p]
+                    cx += points[b, 0]
+                    cy += points[b, 1]
+                    cz += points[b, 2]
+                    total += 1.0
+                break
+            if h == leave[v]:
+                break
+        if total <= 0.0:
+            continue
+        dx, dy, dz = cx / total - x, cy / total - y, cz / total - z
+        if kind[v] == 0:
+            n2 = nx * nx + ny * ny + nz * nz
+            if n2 > 0.0:
+                k = (dx * nx + dy * ny + dz * nz) / n2
+                dx, dy, dz = dx - k * nx, dy - k * ny, dz - k * nz
+        step[v, 0], step[v, 1], step[v, 2] = _DAMPING * dx, _DAMPING * dy, _DAMPING * dz
+
+
+@njit(cache=True, nogil=True)
+def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces):
+    """Move the living to the front, in order; returns their numbers."""
+    renamed = np.empty(n_vertices, np.int64)
+    n = 0
+    for v in range(n_vertices):
+        renamed[v] = n
+        if leave[v] >= 0:
+            leave[n], kind[n] = leave[v], kind[v]
+            for axis in range(3):
+                points[n, axis] = points[v, axis]
+                flat[n, axis] = flat[v, axis]
+            n += 1
+    moved = np.empty(n_faces, np.int64)
+    m = 0
+    for f in range(n_faces):
+        moved[f] = m
+        m += corner[3 * f] >= 0
+    for f in range(n_faces):
+        if corner[3 * f] < 0:
+            continue
+        for k in range(3):
+            h, g = 3 * f + k, 3 * moved[f] + k
+            corner[g] = renamed[corner[h]]
+            feature[g] = feature[h]
+            o = opposite[h]
+            opposite[g] = 3 * moved[o // 3] + o % 3 if o >= 0 else -1
+    for v in range(n):
+        leave[v] = 3 * moved[leave[v] // 3] + leave[v] % 3
+    return n, m

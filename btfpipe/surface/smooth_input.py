@@ -1,0 +1,215 @@
+"""The input mesh as a smooth surface: interpolated normals and Phong tessellation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from btfpipe.surface.topology import edge_normals_angle, half_edges, opposite_half_edges
+
+PHONG_ALPHA = 0.75
+
+
+@dataclass
+class SmoothInput:
+    """A cleaned input mesh that gives a smooth position and a normal for each place on its faces.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float64
+    faces : (m, 3) int32
+    corner_normals : (m, 3, 3) float64
+        Unit normals per face corner: the angle-weighted mean over the faces around the vertex that are
+        not cut off by creases.
+    features : (e, 2) int64
+        Edges that a resampling must keep: boundaries, then creases.
+    feature_face : (e,) int64
+        A face that holds each of them.
+    kind : (n,) uint8
+        0 inside, 1 on a feature, 2 at an end, a branching or a corner of features.
+    ease : (n,) float64
+        1 where the smooth surface may leave the faces, 0 at crease vertices.
+    alpha : float
+        Strength of the Phong tessellation, 0 for the flat faces.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    corner_normals: np.ndarray
+    features: np.ndarray
+    feature_face: np.ndarray
+    kind: np.ndarray
+    ease: np.ndarray
+    alpha: float
+
+    def closest(self, points):
+        """Face and barycentric coordinates of the closest places on the flat faces.
+
+        Parameters
+        ----------
+        points : (k, 3) float64
+
+        Returns
+        -------
+        face : (k,) int64
+        weights : (k, 3) float64
+        nearest : (k, 3) float64
+        """
+        import igl
+
+        points = np.ascontiguousarray(points)
+        _, face, nearest = igl.point_mesh_squared_distance(
+            points, self.vertices, self.faces.astype(np.int64)
+        )
+        return face, self.weights(face, nearest), nearest
+
+    def closest_on_features(self, points):
+        """As `closest`, on the feature edges."""
+        import igl
+
+        points = np.ascontiguousarray(points)
+        _, edge, nearest = igl.point_mesh_squared_distance(points, self.vertices, self.features)
+        face = self.feature_face[edge]
+        return face, self.weights(face, nearest), nearest
+
+    def weights(self, face, points):
+        """Barycentric coordinates, (k, 3), of `points` on the given faces."""
+        return barycentric(points, self.vertices[self.faces[face]])
+
+    def lift(self, face, weights):
+        """Positions on the smooth surface, (k, 3) float64 (Boubekeur and Alexa 2008, eq. 3).
+
+        The point is pulled towards the mean of its projections onto the tangent planes of its face's
+        corners. Unlike there the pull fades towards creases, where the two sides would part.
+        """
+        corners = self.vertices[self.faces[face]]
+        flat = np.einsum("kc,kcx->kx", weights, corners)
+        if self.alpha == 0:
+            return flat
+        normals = self.corner_normals[face]
+        above = np.einsum("kcx,kcx->kc", flat[:, None] - corners, normals)
+        pull = np.einsum("kc,kc,kcx->kx", weights, above, normals)
+        ease = np.einsum("kc,kc->k", weights, self.ease[self.faces[face]])
+        return flat - self.alpha * ease[:, None] * pull
+
+    def normals(self, face, weights):
+        """Unit shading normals, (k, 3) float64, interpolated from the corners."""
+        normals = np.einsum("kc,kcx->kx", weights, self.corner_normals[face])
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        flat = self.corner_normals[face, 0]
+        return np.where(length > 1e-6, normals / np.maximum(length, 1e-6), flat)
+
+
+def barycentric(points, corners):
+    """Barycentric coordinates, (k, 3) float64 in [0, 1], of points (k, 3) in triangles (k, 3, 3).
+
+    Points beside the triangle are brought to its border; a triangle without area gives the place on its longest edge.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    u, w, p = b - a, c - a, points - a
+    uu, uw, ww = _dot(u, u), _dot(u, w), _dot(w, w)
+    pu, pw = _dot(p, u), _dot(p, w)
+    det = uu * ww - uw * uw
+    thin = det <= 1e-14 * np.maximum(uu, ww) ** 2
+    det = np.where(thin, 1.0, det)
+    wb = (ww * pu - uw * pw) / det
+    wc = (uu * pw - uw * pu) / det
+    weights = np.stack([1 - wb - wc, wb, wc], axis=1)
+    if thin.any():
+        weights[thin] = _on_longest_edge(points[thin], corners[thin])
+    weights = np.clip(weights, 0, 1)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _on_longest_edge(points, corners):
+    rows = np.arange(len(points))
+    edges = np.roll(corners, -1, axis=1) - corners
+    k = (edges**2).sum(2).argmax(1)
+    edge, start = edges[rows, k], corners[rows, k]
+    share = _dot(points - start, edge) / np.maximum(_dot(edge, edge), 1e-300)
+    weights = np.zeros((len(points), 3))
+    weights[rows, k] = 1 - share
+    weights[rows, (k + 1) % 3] = share
+    return weights
+
+
+def _dot(a, b):
+    return np.einsum("kx,kx->k", a, b)
+
+
+def smooth_input(vertices, faces, crease_deg=None, alpha=PHONG_ALPHA):
+    """Prepare a cleaned mesh as a smooth surface.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+    faces : (m, 3) int32
+        A consistently oriented manifold.
+    crease_deg : float, optional
+        Edges whose faces' normals differ by more are creases: normals are not averaged across
+        them. None smooths every edge.
+    alpha : float
+        Strength of the Phong tessellation.
+    """
+    opposite = opposite_half_edges(faces)
+    start, end = half_edges(faces)
+    boundary = opposite < 0
+    crease = np.zeros(len(opposite), bool)
+    if crease_deg is not None:
+        crease = ~boundary & (edge_normals_angle(vertices, faces, opposite) > np.deg2rad(crease_deg))
+    normals = _corner_normals(vertices, faces, opposite, crease)
+    keep = np.flatnonzero(boundary | (crease & (np.arange(len(opposite)) > opposite)))
+    features = np.stack([start[keep], end[keep]], axis=1).astype(np.int64)
+    ease = np.ones(len(vertices))
+    ease[start[crease]] = 0
+    return SmoothInput(
+        vertices, faces, normals, features, keep // 3,
+        _kinds(vertices, features), ease, alpha,
+    )  # fmt: skip
+
+
+def _corner_normals(vertices, faces, opposite, crease):
+    """Angle-weighted normals per corner, averaged over the corners not parted by creases."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = 3 * len(faces)
+    h = np.arange(n)
+    after = h - h % 3 + (h + 1) % 3
+    joined = (opposite >= 0) & ~crease
+    # across half-edge h (a to b): the corner of a here is the corner after the opposite half-edge there
+    here = np.concatenate([h[joined], after[joined]])
+    there = np.concatenate([after[opposite[joined]], opposite[joined]])
+    graph = coo_matrix((np.ones(len(here), bool), (here, there)), shape=(n, n))
+    count, group = connected_components(graph, directed=False)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    u = np.roll(corners, -1, axis=1) - corners
+    w = np.roll(corners, 1, axis=1) - corners
+    angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=2), np.einsum("mkx,mkx->mk", u, w))
+    weighted = (angle[..., None] * normal[:, None]).reshape(n, 3)
+    summed = np.stack([np.bincount(group, weighted[:, x], count) for x in range(3)], axis=1)
+    size = np.linalg.norm(summed, axis=1, keepdims=True)
+    fallback = np.zeros_like(summed)
+    fallback[group] = np.repeat(normal, 3, axis=0)
+    fallback[np.linalg.norm(fallback, axis=1) == 0] = (0, 0, 1)
+    mean = np.where(size > 1e-9, summed / np.maximum(size, 1e-9), fallback)
+    return mean[group].reshape(len(faces), 3, 3)
+
+
+def _kinds(vertices, features):
+    """Vertices on features (1) and their ends, branchings and turns over 45 degrees (2)."""
+    n = len(vertices)
+    kind = np.zeros(n, np.uint8)
+    degree = np.bincount(features.ravel(), minlength=n)
+    direction = vertices[features[:, 1]] - vertices[features[:, 0]]
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-300)
+    away = np.zeros((n, 3))
+    np.add.at(away, features[:, 0], direction)
+    np.add.at(away, features[:, 1], -direction)
+    kind[degree > 0] = 1
+    # two unit vectors that leave a straight vertex cancel; at a turn of 45 degrees their sum is 2 sin(22.5 deg) long
+    corner = np.linalg.norm(away, axis=1) > 2 * np.sin(np.pi / 8)
+    kind[(degree > 0) & ((degree != 2) | corner)] = 2
+    return kind
