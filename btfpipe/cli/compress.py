@@ -62,26 +62,27 @@ def compress(samples, method, components, precision, iterations, out, seed, thre
             memory=memory,
             on_progress=report,
         )
+    raw = raw_bytes(sample)
     model.about |= {
         "seed": seed,
         "sample": store.digest(samples[0]),
+        "sample_bytes": raw,
         "source": sample.about.get("source"),
     }
     model.save(out)
-    size, raw = out.stat().st_size, raw_bytes(sample)
-    facts = {
-        k: v
-        for k, v in model.about.items()
-        if k not in ("singular_values", "seed", "sample", "source")
-    }
+    size = out.stat().st_size
     warnings = []
     if model.n_terms < components:
         warnings.append(
             f"the sample's rank is {model.n_terms}: {components - model.n_terms} terms left out"
         )
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"Warning: {warning}.", err=True)
+    shown = ("n_terms", "iterations", "excess", "precision", "rmse", "relative_error")
     return {
         "inputs": list(samples),
-        **facts,
+        **{name: model.about[name] for name in shown},
         "bytes": size,
         "sample_bytes": raw,
         "ratio": raw / size,

@@ -24,7 +24,13 @@ __all__ = [
 ]
 
 
-def raw_bytes(sample):
-    """Bytes of a Sample's pictures, uncompressed: 3 a texel and pair if 8-bit, 6 (half floats) otherwise."""
-    each = 3 if sample.codes.dtype.itemsize == 1 else 6
-    return each * sample.n_pairs * sample.shape[0] * sample.shape[1]
+def raw_bytes(appearance):
+    """Bytes of a Sample's pictures, uncompressed: 3 a texel and pair if 8-bit, 6 (half floats) otherwise.
+
+    Of a Model: those of the Sample it was made from, taken for 8-bit if its file does not say.
+    """
+    codes = getattr(appearance, "codes", None)
+    if codes is None and "sample_bytes" in appearance.about:
+        return appearance.about["sample_bytes"]
+    each = 3 if codes is None or codes.dtype.itemsize == 1 else 6
+    return each * appearance.n_pairs * appearance.shape[0] * appearance.shape[1]

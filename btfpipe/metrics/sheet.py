@@ -56,7 +56,9 @@ def error_sheet(sample, comparisons, pictures_of):
     for name, comparison in comparisons.items():
         matrix = pair_matrix(comparison.display_rmse, sample)
         zoom = max(1, _WIDEST // max(matrix.shape) // max(1, len(comparisons) - 1))
-        drawn = ramp(np.nan_to_num(matrix / worst)).repeat(zoom, 0).repeat(zoom, 1)
+        drawn = ramp(np.nan_to_num(matrix / worst))
+        drawn[np.isnan(matrix)] = 255
+        drawn = drawn.repeat(zoom, 0).repeat(zoom, 1)
         overall = comparison.overall()["display"]
         title = f"{name}: display RMSE {overall['rmse']:.4f}"
         maps.append(_titled(drawn, title))

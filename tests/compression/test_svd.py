@@ -162,6 +162,18 @@ def test_directions_and_facts_are_carried_through_a_file(make_sample, tmp_path):
     assert back.is_product
 
 
+def test_a_list_of_pairs_is_compressed_as_a_list(make_sample):
+    whole = make_sample()
+    some = np.array([5, 99, 7, 60, 61, 62, 130])
+    sample = Sample(
+        whole.codes[some], whole.light_directions, whole.view_directions,
+        whole.light_index[some], whole.view_index[some],
+    )  # fmt: skip
+    model = compress_svd(sample, 21, precision="single")
+    assert not model.is_product
+    np.testing.assert_allclose(matrix(model), matrix(sample), atol=1e-5)
+
+
 def test_texels_and_pictures_agree(make_sample):
     model = compress_svd(make_sample(), 10)
     rows, cols = np.array([0, 3, 15]), np.array([1, 19, 7])
