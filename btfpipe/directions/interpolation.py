@@ -166,8 +166,9 @@ def find(tables, x, y, z, index, weight):
         x /= length
         y /= length
         z = 0.0
-    px = x / (1.0 + z)
-    py = y / (1.0 + z)
+    scale = 1.0 / (1.0 + z)
+    px = x * scale
+    py = y * scale
     i = min(max(int((px + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
     j = min(max(int((py + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
     if tables.mode > 0:
