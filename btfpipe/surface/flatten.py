@@ -198,10 +198,10 @@ def _lay(x, y, a, b, c, va, vb, vc, half, pixel_vertex, pixel_weight):
     if area <= 1e-12:
         return
     slack = 1e-6
-    left = max(-half, int(math.ceil(min(xa, xb, xc) - slack)))
-    right = min(half, int(math.floor(max(xa, xb, xc) + slack)))
-    low = max(-half, int(math.ceil(min(ya, yb, yc) - slack)))
-    high = min(half, int(math.floor(max(ya, yb, yc) + slack)))
+    left = max(-half, math.ceil(min(xa, xb, xc) - slack))
+    right = min(half, math.floor(max(xa, xb, xc) + slack))
+    low = max(-half, math.ceil(min(ya, yb, yc) - slack))
+    high = min(half, math.floor(max(ya, yb, yc) + slack))
     for t in range(low, high + 1):
         for s in range(left, right + 1):
             # Row runs against t (see sample.orientation): the texel at step (s, t) is (-t, s).
@@ -240,7 +240,11 @@ def _fan(vertices, faces, normals, tangents, twin, first, v, scale, placed, x, y
         ring[count] = h
         a = faces.ravel()[_next(h)]
         b = faces.ravel()[_previous(h)]
-        la, lb, lab = _distance(vertices, v, a), _distance(vertices, v, b), _distance(vertices, a, b)
+        la, lb, lab = (
+            _distance(vertices, v, a),
+            _distance(vertices, v, b),
+            _distance(vertices, a, b),
+        )
         cosine = (la * la + lb * lb - lab * lab) / max(2.0 * la * lb, 1e-300)
         placed[1 + count] = a
         x[1 + count] = la * scale

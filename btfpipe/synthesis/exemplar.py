@@ -9,7 +9,9 @@ from btfpipe.analysis.neighbours import coarse_texel, inside_range
 from btfpipe.errors import InputError
 from btfpipe.parallel import single_threaded_blas
 
-TABLE_LIMIT = 2048  # vectors whose distances are tabulated (16 MB); a plain feature image has one a texel
+TABLE_LIMIT = (
+    2048  # vectors whose distances are tabulated (16 MB); a plain feature image has one a texel
+)
 
 # The tables of one level, for a neighbourhood of `side` texels:
 # labels (rows + side - 1, cols + side - 1) int32: with half a neighbourhood on each side.
@@ -85,6 +87,23 @@ def exemplar(features, level, k=None, distance=None):
     )
 
 
+def cut(features, levels):
+    """The features' first levels, so that the last of them has a one-level neighbourhood.
+
+    Raises
+    ------
+    InputError
+        If there are fewer.
+    """
+    have = len(features.levels)
+    if have < levels:
+        raise InputError(
+            f"the features have {have} levels, fewer than --levels {levels}; lower it, or make more with"
+            " `btfpipe textons`."
+        )
+    return features if have == levels else type(features)(features.levels[:levels], features.about)
+
+
 def _tables(level, side, toroidal, distance):
     none = np.zeros((0, 0), np.float32)
     if level is None:
@@ -145,4 +164,13 @@ def wrapped(x, size):
     return x - size * np.floor((x + 0.5) / size)
 
 
-__all__ = ["Exemplar", "Tables", "coarse_texel", "exemplar", "is_inside", "texel_under", "wrapped"]
+__all__ = [
+    "Exemplar",
+    "Tables",
+    "coarse_texel",
+    "cut",
+    "exemplar",
+    "is_inside",
+    "texel_under",
+    "wrapped",
+]

@@ -1,8 +1,10 @@
 """Growing a sample over a surface: the two-pass multi-resolution synthesis of Tong et al. 2002, section 5.
 
 Where this departs from the paper: the coarsest level is walked as a front, in its first sweep places not yet synthesised do not count (instead of
-counting as the random texels that they carry), every level is swept more than once, and the coordinate of a vertex is the mean of
-the runs that lead to its texel, which keeps coherent patches rigid.
+counting as the random texels that they carry), every level is swept more than once, the coordinate of a vertex is the mean of
+the runs that lead to its texel, which keeps coherent patches rigid, and below the coarsest level a texel that continues no run of its
+surroundings must be clearly nearer (as kappa of Hertzmann et al. 2001), or the blending of textons
+between vertices, which favours smooth texels everywhere, would break patches up and lose their grain.
 """
 
 import time
@@ -18,17 +20,18 @@ from btfpipe.sample.orientation import step_to_texels
 from btfpipe.surface.flatten import Flattener, frame_angle
 from btfpipe.synthesis import search
 from btfpipe.synthesis.coordinate_map import CoordinateMap
-from btfpipe.synthesis.exemplar import exemplar, texel_under
+from btfpipe.synthesis.exemplar import cut, exemplar
 
 _BLOCK = 4096  # vertices flattened at once: about 8 MB
-SWEEPS = (4, 2)  # on the coarsest level, on the others
+SWEEPS = (16, 2)  # on the coarsest level, on the others
+COHERENCE = 1.0
 
 Grown = namedtuple("Grown", "row col label")
 
 
 def grow_over_surface(
     features, surface, texels_per_unit=None, *, full=False, k=11, levels=3, sweeps=SWEEPS, turn=0.0, seed=0,
-    threads=1, distance=None, on_progress=None,
+    threads=1, coherence=COHERENCE, distance=None, on_progress=None,
 ):  # fmt: skip
     """Grow a sample over a surface.
 
@@ -46,6 +49,9 @@ def grow_over_surface(
     levels : int
     sweeps : (int, int)
         Times that the coarsest level and every other level are walked.
+    coherence : float
+        By how much the distance of a texel counts more if no run of the patch leads to it; on all levels but the coarsest, which
+        finds the structure. 0 is the paper's choice: the nearest candidate, whatever it breaks.
     turn : float
         Angle of the sample's s axis against the vector field, counter-clockwise, radians.
     seed, threads : int
@@ -63,17 +69,14 @@ def grow_over_surface(
     ------
     InputError
     """
-    for have, what, maker in (
-        (len(features.levels), "the features", "textons"),
-        (len(surface.levels), "the surface", "surface"),
-    ):
-        if have < levels:
-            raise InputError(
-                f"{what} have {have} levels, fewer than --levels {levels}; lower it, or make more with"
-                f" `btfpipe {maker}`."
-            )
+    features = cut(features, levels)
+    if len(surface.levels) < levels:
+        raise InputError(
+            f"the surface has {len(surface.levels)} levels, fewer than --levels {levels}; lower it, or make more"
+            " with `btfpipe surface`."
+        )
     spacing = mean_edge(surface.levels[0])
-    scale = 1.0 / spacing if texels_per_unit is None else float(texels_per_unit)
+    scale = scale_for(surface, features.levels[0].shape, texels_per_unit)
     if not 0.25 <= scale * spacing <= 4.0:
         raise InputError(
             f"{scale:.4g} texels per unit are {scale * spacing:.3g} texels per edge of the surface; expected"
@@ -83,61 +86,37 @@ def grow_over_surface(
         len(surface.levels[i].vertices) * (sweeps[0] if i == levels - 1 else sweeps[1])
         for i in range(levels)
     )
-    done, report, below = 0, [], None
+    finished, report = 0, []
+    below = coarse_mesh = coarse_sample = None
     for i in reversed(range(levels)):
-        sample = exemplar(_cut(features, levels), i, None if full else k, distance)
-        mesh = Flattener(surface.levels[i], scale / 2**i, turn)
+        level = surface.levels[i]
+        sample = exemplar(features, i, None if full else k, distance)
+        mesh = Flattener(level, scale / 2**i, turn)
         n = len(mesh.vertices)
         state = Grown(np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32))
-        growing = below is None
-        if growing:
+        if below is None:
             _scatter(sample, np.uint64(seed), *state)
+            coarse_label = np.zeros(0, np.int32)
         else:
-            _inherit(surface.levels[i], mesh, coarse_mesh, below, coarse_sample, sample, state)
-        grown = np.full(n, not growing)
-        coarse_label = np.zeros(0, np.int32) if growing else below.label
+            _inherit(level, mesh, coarse_mesh, below, coarse_sample, sample, state)
+            coarse_label = below.label
+        done = np.full(n, below is not None)
         order = breadth_first(mesh, int(seed) % n)
-        passes = sweeps[0] if growing else sweeps[1]
-        for sweep in range(passes):
+        flatten = _Flatten(level, mesh, coarse_mesh, sample, order)
+        for sweep in range(sweeps[0] if below is None else sweeps[1]):
             tally = np.zeros(5)
             start, searching = time.perf_counter(), 0.0
-
-            def flatten(block, i=i, mesh=mesh, order=order, sample=sample, growing=growing):
-                vertices = order[block]
-                patches = mesh.squares(vertices, sample.fine.side)
-                if growing:
-                    return vertices, patches, np.empty((0, 0, 3), np.int32), np.empty((0, 0, 3), np.float32)
-                level = surface.levels[i]
-                coarse = coarse_mesh.squares_at(
-                    level.parent_face[vertices], level.parent_weights[vertices], mesh.normals[vertices],
-                    mesh.tangents[vertices], sample.coarse.side,
-                )  # fmt: skip
-                return vertices, patches, *coarse
-
-            for vertices, patches, *coarse in ordered_map(flatten, blocks(n, _BLOCK), threads):
+            for job in ordered_map(flatten, blocks(n, _BLOCK), threads):
                 tick = time.perf_counter()
                 search.grow(
-                    vertices, patches, *coarse, sample, full, growing and sweep == 0, *state, grown,
-                    coarse_label, tally,
+                    *job, sample, full, below is None and sweep == 0,
+                    np.float32(0.0 if below is None else coherence), *state, done, coarse_label, tally,
                 )  # fmt: skip
                 searching += time.perf_counter() - tick
-                done += len(vertices)
+                finished += len(job[0])
                 if on_progress is not None:
-                    on_progress(done, total)
-            report.append(
-                {
-                    "level": i,
-                    "sweep": sweep,
-                    "vertices": n,
-                    "candidates": tally[search.CANDIDATES] / n,
-                    "mean_distance": tally[search.DISTANCE] / n,
-                    "fallbacks": int(tally[search.FALLBACKS]),
-                    "starts": int(tally[search.STARTS]),
-                    "changed": tally[search.MOVED] / n,
-                    "search_seconds": searching,
-                    "seconds": time.perf_counter() - start,
-                }
-            )
+                    on_progress(finished, total)
+            report.append(summary(i, sweep, n, tally, searching, time.perf_counter() - start))
         below, coarse_mesh, coarse_sample = state, mesh, sample
     return CoordinateMap(
         state.row,
@@ -149,11 +128,49 @@ def grow_over_surface(
     )
 
 
-def _cut(features, levels):
-    """The features' first levels, so that the last of them has a one-level neighbourhood."""
-    if len(features.levels) == levels:
-        return features
-    return type(features)(features.levels[:levels], features.about)
+class _Flatten:
+    """What the search needs of a block of vertices: their numbers, patches, and squares on the coarser level."""
+
+    def __init__(self, level, mesh, coarse_mesh, sample, order):
+        self.level, self.mesh, self.coarse_mesh = level, mesh, coarse_mesh
+        self.sample, self.order = sample, order
+
+    def __call__(self, block):
+        vertices = self.order[block]
+        patches = self.mesh.squares(vertices, self.sample.fine.side)
+        if self.coarse_mesh is None:
+            return vertices, patches, np.zeros((0, 0, 3), np.int32), np.zeros((0, 0, 3), np.float32)
+        coarse = self.coarse_mesh.squares_at(
+            self.level.parent_face[vertices], self.level.parent_weights[vertices],
+            self.mesh.normals[vertices], self.mesh.tangents[vertices], self.sample.coarse.side,
+        )  # fmt: skip
+        return vertices, patches, *coarse
+
+
+def summary(level, sweep, n, tally, searching, seconds):
+    """What one sweep over `n` elements did; `tally` as in `search.grow`."""
+    return {
+        "level": level,
+        "sweep": sweep,
+        "elements": n,
+        "candidates": float(tally[search.CANDIDATES] / n),
+        "mean_distance": float(tally[search.DISTANCE] / n),
+        "fallbacks": int(tally[search.FALLBACKS]),
+        "starts": int(tally[search.STARTS]),
+        "changed": float(tally[search.MOVED] / n),
+        "search_seconds": searching,
+        "seconds": seconds,
+    }
+
+
+def scale_for(surface, shape, texels_per_unit=None, repeats=None):
+    """Texels per unit of length: as given, or `repeats` widths of the sample along the longest side, or one a mean edge."""
+    if texels_per_unit is not None:
+        return float(texels_per_unit)
+    if repeats is not None:
+        vertices = np.asarray(surface.levels[0].vertices)
+        return float(repeats * shape[1] / (vertices.max(axis=0) - vertices.min(axis=0)).max())
+    return 1.0 / mean_edge(surface.levels[0])
 
 
 def mean_edge(level):
@@ -205,12 +222,18 @@ def _parent_steps(
             nx, ny, nz = coarse_normals[u, 0], coarse_normals[u, 1], coarse_normals[u, 2]
             sx, sy, sz = coarse_tangents[u, 0], coarse_tangents[u, 1], coarse_tangents[u, 2]
             tx, ty, tz = ny * sz - nz * sy, nz * sx - nx * sz, nx * sy - ny * sx
-            x, y, z = place[0] - vertices[u, 0], place[1] - vertices[u, 1], place[2] - vertices[u, 2]
+            x, y, z = (
+                place[0] - vertices[u, 0],
+                place[1] - vertices[u, 1],
+                place[2] - vertices[u, 2],
+            )
             ds, dt = x * sx + y * sy + z * sz, x * tx + y * ty + z * tz
             length = np.sqrt(x * x + y * y + z * z)
             stretch = scale * length / max(np.sqrt(ds * ds + dt * dt), 1e-12)
             # In the frame half-way from the corner's to the vertex's, as in `flatten`.
-            angle = 0.5 * frame_angle(coarse_normals[u], coarse_tangents[u], normals[v], tangents[v])
+            angle = 0.5 * frame_angle(
+                coarse_normals[u], coarse_tangents[u], normals[v], tangents[v]
+            )
             cosine = np.cos(angle)
             sine = np.sin(angle)
             drow, dcol = step_to_texels(
@@ -259,4 +282,12 @@ def _breadth_first(faces, twin, fan, start, order):
                     break
 
 
-__all__ = ["SWEEPS", "breadth_first", "grow_over_surface", "mean_edge", "texel_under"]
+__all__ = [
+    "COHERENCE",
+    "SWEEPS",
+    "breadth_first",
+    "grow_over_surface",
+    "mean_edge",
+    "scale_for",
+    "summary",
+]

@@ -140,7 +140,7 @@ def _room(tables):
 
 @njit(cache=True, nogil=True)
 def grow(
-    vertices, patches, coarse_vertex, coarse_weight, exemplar, full, skip, row, col, label, done,
+    vertices, patches, coarse_vertex, coarse_weight, exemplar, full, skip, kappa, row, col, label, done,
     coarse_label, tally,
 ):  # fmt: skip
     """Synthesise the given vertices in order.
@@ -154,103 +154,114 @@ def grow(
         Neighbourhoods on the coarser level; n = 0 for none.
     exemplar : Exemplar
     full : bool
-        All texels are candidates, instead of the k-coherent ones.
+        All texels are candidates, instead of the k-coherent ones. Those are also tried for a vertex that has no candidate, because
+        all leave a sample that is not toroidal; such vertices are counted.
     skip : bool
         Leave out of the neighbourhoods what is not `done`.
+    kappa : float32
+        The distance of a texel that no run of the patch leads to is multiplied by ``1 + kappa``; where a share of the runs
+        leads to it, by less in proportion.
     row, col : (all vertices,) float32
         Coordinates; changed in place, as are `label` (int32) and `done` (bool).
     coarse_label : (vertices of the coarser level,) int32
     tally : (5,) float64
-        Sums: candidates compared, distances of those chosen, fallbacks, starts, vertices whose texel changed.
+        Sums: candidates compared, distances of those chosen, fallbacks, starts (vertices that keep their random texel, having
+        no synthesised one near), vertices whose texel changed.
     """
     fine = _room(exemplar.fine)
     coarse = _room(exemplar.coarse)
     compared = np.full(exemplar.rows * exemplar.cols, -1, np.int32)  # the last vertex that did
-    listed = np.full(exemplar.rows * exemplar.cols, -1, np.int32)
+    widest = patches.patch_vertex.shape[1]
+    place = np.empty((widest, 2), np.float32)  # where the runs of the patch lead
+    owners = np.empty(widest, np.int32)
+    support = np.empty(widest, np.float32)
+    fraction = np.empty((widest, 2), np.float32)
     always = np.ones(1, np.bool_)
     low, high, left, right = exemplar.inside
     for i in range(vertices.shape[0]):
         v = vertices[i]
         counting = _resample(
-            patches.pixel_vertex[i], patches.pixel_weight[i], skip, label, done, exemplar.fine, *fine
+            patches.pixel_vertex[i],
+            patches.pixel_weight[i],
+            skip,
+            label,
+            done,
+            exemplar.fine,
+            *fine,
         )
         if exemplar.coarse.side > 0:
             _resample(
                 coarse_vertex[i], coarse_weight[i], False, coarse_label, always, exemplar.coarse, *coarse
             )  # fmt: skip
-        best = -1
-        best_distance = np.float32(np.inf)
-        best_row = np.float32(0.0)
-        best_col = np.float32(0.0)
-        found = 0
-        if not full:
-            for j in range(patches.patch_vertex.shape[1]):
-                u = patches.patch_vertex[i, j]
-                if u < 0:
-                    break
-                if not done[u]:
-                    continue
-                r = row[u] + patches.patch_step[i, j, 0]
-                c = col[u] + patches.patch_step[i, j, 1]
-                owner = texel_under(r, c, exemplar)
-                if owner < 0 or listed[owner] == i:
-                    continue
-                listed[owner] = i
-                for e in range(exemplar.lists.shape[1]):
-                    texel = exemplar.lists[owner, e]
-                    if compared[texel] == i or (e == 0 and not is_inside(texel, exemplar)):
-                        continue
-                    compared[texel] = i
-                    found += 1
-                    distance = _two_levels(texel, exemplar, fine, coarse, best_distance)
-                    if distance < best_distance:
-                        best_distance = distance
-                        best = texel
-                        best_row = r - np.floor(r + np.float32(0.5))
-                        best_col = c - np.floor(c + np.float32(0.5))
+        runs = 0
+        for j in range(widest):
+            u = patches.patch_vertex[i, j]
+            if u < 0:
+                break
+            if done[u]:
+                place[runs, 0] = row[u] + patches.patch_step[i, j, 0]
+                place[runs, 1] = col[u] + patches.patch_step[i, j, 1]
+                runs += 1
+        n = _gather(place[:runs], exemplar, compared, i, owners, support, fraction)
         if counting == 0:
             tally[STARTS] += 1
             done[v] = True
             continue
-        if best < 0:
-            if not full:
+        best = -1
+        best_run = -1
+        best_distance = np.float32(np.inf)  # as measured
+        lowest = np.float32(np.inf)  # with the penalty for incoherence
+        found = 0
+        for j in range(n):
+            if is_inside(owners[j], exemplar):
+                found += 1
+                penalty = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
+                distance = _two_levels(owners[j], exemplar, fine, coarse, lowest / penalty)
+                if distance * penalty < lowest:
+                    lowest = distance * penalty
+                    best_distance = distance
+                    best = owners[j]
+                    best_run = j
+        penalty = np.float32(1.0) + kappa
+        limit = lowest / penalty
+        if not full:
+            for j in range(n):
+                for e in range(1, exemplar.lists.shape[1]):
+                    texel = exemplar.lists[owners[j], e]
+                    if compared[texel] == i:
+                        continue
+                    compared[texel] = i
+                    found += 1
+                    distance = _two_levels(texel, exemplar, fine, coarse, limit)
+                    if distance < limit:
+                        limit = distance
+                        best_distance = distance
+                        best = texel
+                        best_run = j
+            if best < 0:
                 tally[FALLBACKS] += 1
+        if full or best < 0:
             for r in range(low, high):
                 for c in range(left, right):
                     texel = r * exemplar.cols + c
+                    if compared[texel] == i:
+                        continue
                     found += 1
-                    distance = _two_levels(texel, exemplar, fine, coarse, best_distance)
-                    if distance < best_distance:
+                    distance = _two_levels(texel, exemplar, fine, coarse, limit)
+                    if distance < limit:
+                        limit = distance
                         best_distance = distance
                         best = texel
-        # The fraction: the mean of all runs that lead to this texel, so that a run that closes on itself stays rigid.
+                        best_run = -1
         r0 = best // exemplar.cols
         c0 = best - r0 * exemplar.cols
-        sum_row = np.float32(0.0)
-        sum_col = np.float32(0.0)
-        runs = np.float32(0.0)
-        for j in range(patches.patch_vertex.shape[1]):
-            u = patches.patch_vertex[i, j]
-            if u < 0:
-                break
-            if not done[u]:
-                continue
-            dr = row[u] + patches.patch_step[i, j, 0] - r0
-            dc = col[u] + patches.patch_step[i, j, 1] - c0
-            if exemplar.toroidal:
-                dr -= exemplar.rows * np.floor(dr / exemplar.rows + np.float32(0.5))
-                dc -= exemplar.cols * np.floor(dc / exemplar.cols + np.float32(0.5))
-            if abs(dr) <= 0.75 and abs(dc) <= 0.75:
-                sum_row += dr
-                sum_col += dc
-                runs += np.float32(1.0)
-        if runs > 0:
-            best_row = min(max(sum_row / runs, np.float32(-0.49)), np.float32(0.49))
-            best_col = min(max(sum_col / runs, np.float32(-0.49)), np.float32(0.49))
         if texel_under(row[v], col[v], exemplar) != best:
             tally[MOVED] += 1
-        row[v] = r0 + best_row
-        col[v] = c0 + best_col
+        row[v] = r0
+        col[v] = c0
+        if best_run >= 0:
+            row[v] += fraction[best_run, 0]
+            col[v] += fraction[best_run, 1]
         label[v] = exemplar.fine.labels[r0 + exemplar.fine.side // 2, c0 + exemplar.fine.side // 2]
         done[v] = True
         tally[CANDIDATES] += found
@@ -258,7 +269,45 @@ def grow(
 
 
 @njit(cache=True, nogil=True)
-def inherit(face, weight, parent_faces, step, parent_row, parent_col, exemplar, rows, cols, row, col, label):
+def _gather(place, exemplar, compared, i, owners, support, fraction):
+    """The distinct texels that the runs of a patch lead to, each with the share of the runs that do and their mean fraction.
+
+    A run leads to all texels within 0.75 texel: one that ends near the middle between two is not split. The mean keeps a
+    run that meets itself again rigid. Returns the number of texels, which are marked as compared.
+    """
+    n = 0
+    for j in range(place.shape[0]):
+        texel = texel_under(place[j, 0], place[j, 1], exemplar)
+        if texel < 0 or compared[texel] == i:
+            continue
+        compared[texel] = i
+        r = texel // exemplar.cols
+        c = texel - r * exemplar.cols
+        sum_row = np.float32(0.0)
+        sum_col = np.float32(0.0)
+        count = np.float32(0.0)
+        for m in range(place.shape[0]):
+            dr = place[m, 0] - r
+            dc = place[m, 1] - c
+            if exemplar.toroidal:
+                dr -= exemplar.rows * np.floor(dr / exemplar.rows + np.float32(0.5))
+                dc -= exemplar.cols * np.floor(dc / exemplar.cols + np.float32(0.5))
+            if abs(dr) <= 0.75 and abs(dc) <= 0.75:
+                sum_row += dr
+                sum_col += dc
+                count += np.float32(1.0)
+        owners[n] = texel
+        support[n] = count / place.shape[0]
+        fraction[n, 0] = min(max(sum_row / count, np.float32(-0.49)), np.float32(0.49))
+        fraction[n, 1] = min(max(sum_col / count, np.float32(-0.49)), np.float32(0.49))
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def inherit(
+    face, weight, parent_faces, step, parent_row, parent_col, exemplar, rows, cols, row, col, label
+):
     """First pass (section 5.1): coordinates from the places on the coarser level.
 
     Parameters
@@ -308,4 +357,6 @@ def inherit(face, weight, parent_faces, step, parent_row, parent_col, exemplar, 
         row[v] = r
         col[v] = c
         half = exemplar.fine.side // 2
-        label[v] = exemplar.fine.labels[int(np.floor(r + 0.5)) + half, int(np.floor(c + 0.5)) + half]
+        label[v] = exemplar.fine.labels[
+            int(np.floor(r + 0.5)) + half, int(np.floor(c + 0.5)) + half
+        ]

@@ -1,0 +1,104 @@
+"""Features for synthesis out of whatever is at hand: a Features file, an array, a picture, a Sample or a Model."""
+
+from pathlib import Path
+
+import numpy as np
+
+from btfpipe.errors import InputError
+
+_DIMENSIONS = 16  # of the appearance of a BTF's texel that plain features keep
+
+
+def read_features(path, k, levels, *, toroidal=False, seed=0, threads=1, memory=2 << 30):
+    """Features of a file, with neighbour lists of at least `k`.
+
+    A Features file is taken as it is, lists are added only if it has none. An ``.npy`` array (rows, cols, d) and a picture are plain
+    feature images: compared as stored, without textons. So are the texels of a Sample or a Model: the 16 leading
+    coordinates of its SVD, whose distances are nearly those of the BTF itself (Eckart and Young).
+
+    Parameters
+    ----------
+    path : path-like
+    k : int or None
+        None if no lists are needed (full search).
+    levels : int
+        Levels to make; a Features file keeps its own.
+    toroidal : bool
+        Whether an array or a picture continues at its opposite border; the other files say so themselves.
+    seed, threads, memory
+        For the SVD of a Sample, and for the lists.
+
+    Returns
+    -------
+    Features
+
+    Raises
+    ------
+    InputError
+    """
+    from btfpipe import store
+    from btfpipe.analysis.features import Features
+    from btfpipe.analysis.neighbours import add_neighbour_lists
+    from btfpipe.analysis.pyramid import plain_features
+
+    path = Path(path)
+    kind = _kind(path)
+    if kind == "features":
+        features = Features.open(path)
+    else:
+        if kind in ("sample", "model"):
+            image, toroidal = _appearance_image(path, seed, threads, memory)
+        elif kind is not None:
+            raise InputError(
+                f"{path}: holds a {kind}; expected features, a sample, a model, an array or a picture."
+            )
+        elif path.suffix.lower() == ".npy":
+            image = _array(path)
+        else:
+            from btfpipe.formats.images import colours, open_picture
+
+            picture = open_picture(path)
+            image = np.asarray(colours(picture, path), np.float32)
+        try:
+            features = plain_features(
+                image, toroidal, levels, sample_digest=store.digest(path), source=path.name
+            )
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    if k is not None and k > 1 and any(level.neighbours is None for level in features.levels):
+        about = features.about
+        add_neighbour_lists(
+            features, k, about["neighbourhood"], about["coarse_neighbourhood"], threads=threads
+        )
+    return features
+
+
+def _kind(path):
+    """The kind of one of our own files, None for anything else."""
+    import zipfile
+
+    from btfpipe import store
+
+    return store.read(path).kind if zipfile.is_zipfile(path) else None
+
+
+def _appearance_image(path, seed, threads, memory):
+    from btfpipe.analysis.textons import eigen_textures, picture_weights
+    from btfpipe.compression import open_appearance
+    from btfpipe.parallel import single_threaded_blas
+
+    appearance = open_appearance(path)
+    textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
+    with single_threaded_blas():
+        image = textures @ picture_weights(angular)[:, :_DIMENSIONS]
+    return image, appearance.toroidal
+
+
+def _array(path):
+    try:
+        image = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: not an array of numbers ({error}).") from error
+    if image.dtype.kind not in "fiub":
+        raise InputError(f"{path}: holds {image.dtype}; expected numbers (rows, cols, features).")
+    return image[..., None] if image.ndim == 2 else image
