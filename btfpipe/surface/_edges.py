@@ -260,7 +260,9 @@ def collapse_short(
             stretched = False
             for i in range(n_a + n_b if both else n_a):
                 v = near_a[i] if i < n_a else near_b[i - n_a]
-                if (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2 > bound:
+                if (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (
+                    points[v, 2] - z
+                ) ** 2 > bound:
                     stretched = True
                     break
             f0 = h // 3
@@ -359,10 +361,9 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         vx, vy, vz = _cross(dx, dy, dz, bx, by, bz, cx, cy, cz)
         sx, sy, sz = px + qx, py + qy, pz + qz
         size = np.sqrt(sx * sx + sy * sy + sz * sz)
-        if (
-            ux * sx + uy * sy + uz * sz <= 0.3 * size * np.sqrt(ux * ux + uy * uy + uz * uz)
-            or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz)
-        ):
+        if ux * sx + uy * sy + uz * sz <= 0.3 * size * np.sqrt(
+            ux * ux + uy * uy + uz * uz
+        ) or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz):
             continue
         o_bc, m_bc = opposite[h1], feature[h1]
         o_ca, m_ca = opposite[h2], feature[h2]
@@ -402,8 +403,16 @@ def _adjacent(corner, opposite, leave, a, b):
 @njit(cache=True, nogil=True)
 def _cotangent(points, v, a, b):
     """Cotangent of the angle at v in the triangle v, a, b."""
-    ux, uy, uz = points[a, 0] - points[v, 0], points[a, 1] - points[v, 1], points[a, 2] - points[v, 2]
-    wx, wy, wz = points[b, 0] - points[v, 0], points[b, 1] - points[v, 1], points[b, 2] - points[v, 2]
+    ux, uy, uz = (
+        points[a, 0] - points[v, 0],
+        points[a, 1] - points[v, 1],
+        points[a, 2] - points[v, 2],
+    )
+    wx, wy, wz = (
+        points[b, 0] - points[v, 0],
+        points[b, 1] - points[v, 1],
+        points[b, 2] - points[v, 2],
+    )
     cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
     area = np.sqrt(cx * cx + cy * cy + cz * cz)
     return (ux * wx + uy * wy + uz * wz) / max(area, 1e-300)

@@ -117,13 +117,16 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=8, sett
         Barycentric coordinates there. `source.lift` and `source.normals` give position and normal.
     """
     mesh = _Mesh(source)
-    area = 0.5 * np.linalg.norm(
-        np.cross(
-            source.vertices[source.faces[:, 1]] - source.vertices[source.faces[:, 0]],
-            source.vertices[source.faces[:, 2]] - source.vertices[source.faces[:, 0]],
-        ),
-        axis=1,
-    ).sum()
+    area = (
+        0.5
+        * np.linalg.norm(
+            np.cross(
+                source.vertices[source.faces[:, 1]] - source.vertices[source.faces[:, 0]],
+                source.vertices[source.faces[:, 2]] - source.vertices[source.faces[:, 0]],
+            ),
+            axis=1,
+        ).sum()
+    )
     # an even mesh has 2 faces a vertex, each of area sqrt(3)/4 times the squared edge
     target = np.sqrt(area / n_vertices * 2 / np.sqrt(3))
     mesh.place(source, np.zeros((mesh.n_vertices, 3)), np.inf)

@@ -155,7 +155,9 @@ def smooth_input(vertices, faces, crease_deg=None, alpha=PHONG_ALPHA):
     boundary = opposite < 0
     crease = np.zeros(len(opposite), bool)
     if crease_deg is not None:
-        crease = ~boundary & (edge_normals_angle(vertices, faces, opposite) > np.deg2rad(crease_deg))
+        crease = ~boundary & (
+            edge_normals_angle(vertices, faces, opposite) > np.deg2rad(crease_deg)
+        )
     normals = _corner_normals(vertices, faces, opposite, crease)
     keep = np.flatnonzero(boundary | (crease & (np.arange(len(opposite)) > opposite)))
     features = np.stack([start[keep], end[keep]], axis=1).astype(np.int64)

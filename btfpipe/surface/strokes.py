@@ -1,0 +1,56 @@
+"""Strokes: a small YAML file that says where the sample's right-hand direction should point."""
+
+import math
+from pathlib import Path
+
+from btfpipe.errors import InputError
+
+_FORM = "strokes: [{point: [x, y, z], vector: [x, y, z]}, ...]"
+
+
+def read_strokes(path):
+    """Read strokes, a list of (point, vector), tuples of three floats in the mesh's frame and unit.
+
+    Raises
+    ------
+    InputError
+        For a file that is not YAML, an unknown or missing key (named), and anything but three finite numbers.
+    """
+    import yaml
+
+    path = Path(path)
+    try:
+        thing = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        said = " ".join(str(error).split())
+        raise InputError(f"{path}: not YAML ({said}). Expected {_FORM}.") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+    _check_keys(path, "the file", thing, {"strokes"})
+    strokes = thing["strokes"]
+    if not isinstance(strokes, list) or not strokes:
+        raise InputError(f"{path}: strokes is not a list of at least one stroke. Expected {_FORM}.")
+    return [_stroke(path, i, stroke) for i, stroke in enumerate(strokes, 1)]
+
+
+def _stroke(path, i, stroke):
+    _check_keys(path, f"stroke {i}", stroke, {"point", "vector"})
+    for key in ("point", "vector"):
+        numbers = stroke[key]
+        if not (
+            isinstance(numbers, list)
+            and len(numbers) == 3
+            and all(type(x) in (int, float) and math.isfinite(x) for x in numbers)
+        ):
+            raise InputError(f"{path}: stroke {i}: {key} is {numbers!r}; expected three numbers.")
+    if not any(stroke["vector"]):
+        raise InputError(f"{path}: stroke {i}: vector has no length; give a direction.")
+    return tuple(map(float, stroke["point"])), tuple(map(float, stroke["vector"]))
+
+
+def _check_keys(path, where, thing, keys):
+    found = set(thing) if isinstance(thing, dict) else set()
+    for key in sorted(found - keys, key=str):
+        raise InputError(f"{path}: {where} has the unknown key {key!r}. Expected {_FORM}.")
+    for key in sorted(keys - found):
+        raise InputError(f"{path}: {where} lacks {key}. Expected {_FORM}.")
