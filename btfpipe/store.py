@@ -213,6 +213,12 @@ class Reader:
                         f"{_expected(kind)} `btfpipe info {path}` says what it is."
                     )
                 self.about = json.loads(archive.read(_ABOUT))
+                if not (
+                    isinstance(self.about, dict)
+                    and isinstance(self.about.get("kind"), str)
+                    and isinstance(self.about.get("format"), int)
+                ):
+                    raise ValueError(f"{_ABOUT} names no kind and format")
                 for info in archive.infolist():
                     self._members[info.filename] = info
         except FileNotFoundError as error:
@@ -222,10 +228,10 @@ class Reader:
                 f"{path}: not a btfpipe file, or damaged ({error}).{_expected(kind)}"
                 f" `btfpipe info {path}` says what it is."
             ) from error
-        found = self.about.get("kind")
+        found = self.about["kind"]
         if kind is not None and found not in ((kind,) if isinstance(kind, str) else kind):
             raise InputError(f"{path}: holds a {found}.{_expected(kind)}")
-        if self.about.get("format", 0) > FORMAT_VERSION:
+        if self.about["format"] > FORMAT_VERSION:
             raise InputError(
                 f"{path}: format version {self.about['format']}, written by btfpipe"
                 f" {self.about.get('btfpipe')}; this is {__version__}, which reads up to"
