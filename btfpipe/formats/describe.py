@@ -11,12 +11,12 @@ from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.archive import is_zip, open_archive
 from btfpipe.formats.images import Decoder, is_mislabelled, open_picture
+from btfpipe.formats.meshes import ENDINGS, read_mesh
 from btfpipe.formats.ubo import Listing
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.describe import describe_directions
 
 _LISTED = 20
-_MESHES = (".obj", ".ply", ".off", ".stl")
 
 
 def describe_foreign(path, threads=1, report=lambda done, total: None):
@@ -33,9 +33,7 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
             return _describe_set(path, threads, report)
         except InputError as error:
             return {"kind": "folder" if path.is_dir() else "zip", "problems": [str(error)]}
-    if path.suffix.lower() in _MESHES:
-        from btfpipe.formats.meshes import describe_mesh
-
+    if path.suffix.lower() in ENDINGS:
         return describe_mesh(path)
     try:
         picture = open_picture(path)
@@ -76,6 +74,38 @@ def describe_picture(picture, path):
         "stored_as": str(values.dtype),
         "layers": described,
         "problems": problems,
+    }
+
+
+def describe_mesh(path):
+    """Describe a mesh file: size, extent, topology, repairs that `surface` would make, and why it could not."""
+    from btfpipe.surface.cleaning import clean
+    from btfpipe.surface.topology import describe
+
+    description = {"kind": "mesh", "format": Path(path).suffix[1:].lower()}
+    try:
+        vertices, faces = read_mesh(path)
+    except InputError as error:
+        return description | {"problems": [str(error)]}
+    finite = np.isfinite(vertices).all(axis=1)
+    description |= {
+        "vertices": len(vertices),
+        "faces": len(faces),
+        "least": vertices[finite].min(axis=0).tolist() if finite.any() else None,
+        "greatest": vertices[finite].max(axis=0).tolist() if finite.any() else None,
+        "not_finite": int((~finite).sum()),
+    }
+    try:
+        vertices, faces, repairs = clean(vertices, faces, str(path))
+    except InputError as error:
+        return description | {"problems": [str(error)]}
+    euler, loops, _ = describe(faces, len(vertices))
+    return description | {
+        "components": len(euler),
+        "boundary_loops": int(loops.sum()),
+        "genus": int(((2 - loops - euler) // 2).sum()),
+        "repairs": repairs,
+        "problems": [],
     }
 
 

@@ -1,0 +1,219 @@
+import json
+
+import numpy as np
+import pytest
+
+from btfpipe import store
+from btfpipe.formats.images import encode_picture, write_picture
+from btfpipe.sample import Sample
+
+
+@pytest.fixture
+def info(btfpipe):
+    """What `info --json` says of a file."""
+
+    def run(path):
+        return json.loads(btfpipe("info", path, "--json").stdout)
+
+    return run
+
+
+def test_a_sample_is_explained(info, make_sample, tmp_path):
+    make_sample(
+        dtype=np.uint8, transfer="srgb", toroidal=True, texels_per_mm=3.0, scale=2.0, absolute=True
+    ).save(tmp_path / "s.npz")
+    said = info(tmp_path / "s.npz")
+    assert said["kind"] == "sample"
+    assert said["problems"] == []
+    sample = said["sample"]
+    assert (sample["rows"], sample["cols"], sample["pairs"]) == (16, 20, 19 * 7)
+    assert sample["views"] == {"number": 7, "set": None, "rings_deg": {"0": 1, "15": 6}}
+    assert (sample["transfer"], sample["scale"], sample["texels_per_mm"]) == ("srgb", 2, 3)
+    assert sample["toroidal"]
+    assert sample["product"]
+    assert sample["absolute_scale"] == "known"
+
+
+def test_bonns_directions_are_known(info, make_sample, tmp_path):
+    from btfpipe.directions import bonn81, ubo2014
+
+    make_sample(2, 2, lights=bonn81(), views=ubo2014()).save(tmp_path / "s.npz")
+    sample = info(tmp_path / "s.npz")["sample"]
+    assert sample["lights"]["set"] == "Bonn's 81"
+    assert sample["views"]["set"] == "UBO2014's 151"
+
+
+def test_clipped_values_are_counted(info, make_sample, tmp_path):
+    sample = make_sample(dtype=np.uint8)
+    codes = np.minimum(sample.codes, 254)
+    codes[3, 2, 1, 0] = codes[5, :2, 0, 2] = 255
+    sample.codes = codes
+    sample.save(tmp_path / "s.npz")
+    assert info(tmp_path / "s.npz")["sample"]["clipped_values"] == 3
+
+
+def test_values_that_are_not_finite_are_a_problem(info, make_sample, tmp_path):
+    sample = make_sample()
+    sample.codes[3, 2, 1, 0] = np.nan
+    sample.codes[5, :2, 0, 2] = np.inf
+    sample.save(tmp_path / "s.npz")
+    said = info(tmp_path / "s.npz")
+    assert said["arrays"]["pictures"]["not_finite"] == 3
+    assert said["problems"] == ["pictures holds 3 NaN or infinite values."]
+
+
+def test_missing_and_double_pairs_are_named(info, make_sample, tmp_path):
+    full = make_sample(4, 4)
+    keep = [0, 0, *range(2, full.n_pairs)]
+    Sample(
+        full.codes[keep],
+        full.light_directions,
+        full.view_directions,
+        full.light_index[keep],
+        full.view_index[keep],
+    ).save(tmp_path / "s.npz")
+    said = info(tmp_path / "s.npz")
+    assert (said["sample"]["missing_pairs"], said["sample"]["duplicate_pairs"]) == (1, 1)
+    assert any("view 0 light 1" in problem for problem in said["problems"])
+    assert any("twice" in problem for problem in said["problems"])
+
+
+@pytest.mark.parametrize("kind", ["model", "features", "surface", "map"])
+def test_every_kind_of_our_own_is_described(info, tmp_path, kind):
+    store.write(
+        tmp_path / "x.npz", kind, {"values": np.array([1.0, np.nan]), "n": np.arange(3)}, seed=5
+    )
+    said = info(tmp_path / "x.npz")
+    assert said["kind"] == kind
+    assert said["about"]["seed"] == 5
+    assert said["arrays"]["n"] == {"shape": [3], "dtype": "int64"}
+    assert said["problems"] == ["values holds 1 NaN or infinite values."]
+
+
+def test_a_damaged_array_is_a_problem_and_the_rest_is_still_described(info, make_sample, tmp_path):
+    path = tmp_path / "s.npz"
+    make_sample().save(path)
+    data = path.read_bytes()
+    place = data.rindex(b"\x93NUMPY")
+    path.write_bytes(data[:place] + b"XXXXXX" + data[place + 6 :])
+    said = info(path)
+    assert "pictures" in said["problems"][0]
+    assert "light_index" in said["arrays"]
+
+
+def test_a_set_is_explained_with_all_that_is_wrong(info, make_measurement):
+    def change(members):
+        names = list(members)
+        members["again tl000 pl000 tv000 pv360.png"] = members[names[0]]
+        members["readme.txt"] = b"x"
+        del members[names[1]]
+        members[names[2]] = members[names[2]][:50]
+        members[names[3]] = encode_picture(np.full((9, 5, 3), 255, np.uint8), ".png")
+
+    path, _ = make_measurement(change=change)
+    said = info(path)
+    assert said["kind"] == "UBO2003 set"
+    assert (said["pairs"], said["missing_pairs"], said["duplicate_pairs"]) == (5, 1, 1)
+    assert said["ignored"] == ["readme.txt"]
+    assert said["clipped_values"] == 9 * 5 * 3
+    assert said["lights"]["rings_deg"] == {"0": 1, "30": 2}
+    problems = "\n".join(said["problems"])
+    for words in ("1 pictures cannot be read", "truncated", "tl30 pl0 tv0 pv0", "twice", "9 x 5"):
+        assert words in problems
+
+
+def test_a_sound_set_has_no_problems(info, make_measurement):
+    said = info(make_measurement("folder", suffix=".exr", dtype=np.float16)[0])
+    assert said["problems"] == []
+    assert (said["rows"], said["cols"], said["stored_as"]) == (6, 8, "float16")
+
+
+def test_values_that_are_not_finite_in_a_set_are_named(info, make_measurement):
+    def change(members):
+        picture = np.ones((6, 8, 3), np.float16)
+        picture[0, 0, 0] = np.inf
+        members[list(members)[2]] = encode_picture(picture, ".exr")
+
+    path, _ = make_measurement(suffix=".exr", dtype=np.float16, change=change)
+    (problem,) = info(path)["problems"]
+    assert "tl030 pl090 tv000 pv000.exr: 1 NaN or infinite" in problem
+
+
+def test_layers_of_an_exr_are_told_apart(info, tmp_path):
+    values = np.zeros((4, 5, 5), np.float32)
+    values[..., 3] = 2
+    values[1, 1, 4] = np.nan
+    write_picture(tmp_path / "a.exr", values, names=["R", "G", "B", "depth.Z", "normal.X"])
+    said = info(tmp_path / "a.exr")
+    assert (said["kind"], said["rows"], said["cols"]) == ("picture", 4, 5)
+    assert said["layers"]["colour"]["channels"] == ["R", "G", "B"]
+    assert said["layers"]["depth"]["greatest"] == 2
+    assert said["problems"] == ["layer normal: 1 NaN or infinite values."]
+
+
+def test_a_mislabelled_picture_is_a_problem(info, tmp_path, rng):
+    (tmp_path / "a.jpg").write_bytes(
+        encode_picture(rng.integers(0, 9, (4, 4, 3), np.uint8), ".png")
+    )
+    said = info(tmp_path / "a.jpg")
+    assert said["format"] == "png"
+    assert "png" in said["problems"][0]
+
+
+def test_a_mesh_is_described(info, tmp_path):
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 2)]
+    faces = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]
+    text = [f"v {x} {y} {z}" for x, y, z in corners]
+    text += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    (tmp_path / "a.obj").write_text("\n".join(text))
+    said = info(tmp_path / "a.obj")
+    assert (said["kind"], said["vertices"], said["faces"]) == ("mesh", 4, 4)
+    assert (said["components"], said["boundary_loops"], said["genus"]) == (1, 0, 0)
+    assert said["greatest"] == [1, 1, 2]
+    assert said["problems"] == []
+    (tmp_path / "b.obj").write_text("\n".join(text[:4]))
+    assert "no faces" in info(tmp_path / "b.obj")["problems"][0]
+    (tmp_path / "c.obj").write_text("\n".join([*text, "v 3 3 3", "f 1 2 5"]))
+    assert "faces" in info(tmp_path / "c.obj")["problems"][0]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "kind"),
+    [
+        ("a.bin", b"\x00\x01\x02", "unknown"),
+        ("empty.jpg", b"", "unknown"),
+        ("cut.zip", b"PK\x03\x04 and no more", "zip"),
+        ("notes.txt", b"hello", "unknown"),
+    ],
+)
+def test_what_is_unknown_or_damaged_is_said_to_be_so(info, tmp_path, name, data, kind):
+    (tmp_path / name).write_bytes(data)
+    said = info(tmp_path / name)
+    assert said["kind"] == kind
+    assert name in said["problems"][0]
+
+
+def test_folders_and_zips_of_something_else_are_said_to_be_so(info, tmp_path):
+    (tmp_path / "notes.txt").write_text("x")
+    said = info(tmp_path)
+    assert (said["kind"], said["files"]) == ("folder", 1)
+    np.savez(tmp_path / "numpy.npz", x=np.zeros(3))
+    assert info(tmp_path / "numpy.npz")["kind"] == "zip"
+
+
+def test_without_json_a_person_reads_it_on_stdout(btfpipe, make_sample, make_measurement, tmp_path):
+    make_sample().save(tmp_path / "s.npz")
+    result = btfpipe("info", tmp_path / "s.npz")
+    assert result.stderr == ""
+    assert result.stdout.startswith(f"{tmp_path / 's.npz'}:\n  kind: sample\n")
+    assert "rings_deg: 0 1, 15 6\n" in result.stdout
+    assert result.stdout.endswith("problems: none\n")
+    path, _ = make_measurement(change=lambda m: m.pop(next(iter(m))))
+    assert "  - 1 view/light pairs are missing: tl0 pl0 tv0 pv0" in btfpipe("info", path).stdout
+
+
+def test_a_newer_file_is_refused(btfpipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "FORMAT_VERSION", store.FORMAT_VERSION + 1)
+    store.write(tmp_path / "a.npz", "sample", {})
+    monkeypatch.undo()
+    assert "newer btfpipe" in btfpipe("info", tmp_path / "a.npz", code=3).stderr
