@@ -5,10 +5,6 @@ from numba import njit
 
 from btfpipe.hashing import uniform
 
-# How far shadow rays start above the facet, where shading and facet normals differ: in edges of the face, times
-# the sine between them. Neighbouring facets of a smooth surface then do not shade each other.
-_LIFT = 2.0
-
 
 @njit(cache=True, nogil=True)
 def camera_rays(
@@ -49,7 +45,7 @@ def camera_rays(
 
 @njit(cache=True, nogil=True)
 def surface_points(
-    hits, prim, origins, directions, vertices, faces, normals, smallest,
+    hits, prim, origins, directions, vertices, faces, normals, clearance, smallest,
     share, point, start, normal, facing, depth,
 ):  # fmt: skip
     """What shading needs of each hit.
@@ -60,6 +56,8 @@ def surface_points(
         Rays that hit.
     prim : (rays,) int32
         Face of each ray.
+    clearance : (vertices,) float64
+        See `clearance.clearance`.
     smallest : float
         Distance that rounding of positions cannot bridge.
     share : (n, 3) float64
@@ -157,9 +155,7 @@ def surface_points(
                 ox += scale * normals[i, 0]
                 oy += scale * normals[i, 1]
                 oz += scale * normals[i, 2]
-        cosine = min(gx * nx + gy * ny + gz * nz, 1.0)
-        edge = np.sqrt(max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz))
-        lift = smallest + _LIFT * edge * np.sqrt(1.0 - cosine * cosine)
+        lift = smallest + u * clearance[a] + v * clearance[b] + w * clearance[c]
         start[h, 0] = x + ox + lift * gx
         start[h, 1] = y + oy + lift * gy
         start[h, 2] = z + oz + lift * gz

@@ -5,6 +5,7 @@ import numpy as np
 from btfpipe.parallel import ordered_map
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
+from btfpipe.rendering.clearance import clearance
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 _RAYS = (
@@ -30,6 +31,9 @@ class Renderer:
         self.seed = seed
         self.vertices = np.concatenate([t.vertices for t in scene.objects])
         self.normals = np.concatenate([t.normals for t in scene.objects])
+        self.clearance = np.concatenate(
+            [clearance(t.vertices, t.faces, t.normals) for t in scene.objects]
+        )
         first_vertex = np.cumsum([0] + [len(t.vertices) for t in scene.objects])
         self.first_face = np.cumsum([0] + [len(t.faces) for t in scene.objects])
         self.faces = np.concatenate(
@@ -132,7 +136,7 @@ class Points:
         self.facing, self.depth = np.empty(n), np.empty(n)
         kernels.surface_points(
             hits, prim, origins, directions, renderer.vertices, renderer.faces, renderer.normals,
-            renderer.smallest, self.share, self.point, self.start, self.normal, self.facing,
+            renderer.clearance, renderer.smallest, self.share, self.point, self.start, self.normal, self.facing,
             self.depth,
         )  # fmt: skip
         self.toward_eye = -directions[hits]

@@ -52,6 +52,11 @@ def uv_sphere(rings=96, segments=192):
     return level, lat, lon
 
 
+@pytest.fixture(name="uv_sphere")
+def _uv_sphere():
+    return uv_sphere
+
+
 @pytest.fixture
 def sphere(tmp_path):
     """Write a sphere's Surface and a map whose coordinates a function of latitude and longitude gives."""

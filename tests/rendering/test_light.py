@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from btfpipe.rendering.camera import filter_table, strata
+from btfpipe.rendering.clearance import clearance
+from btfpipe.surface import Surface
+from btfpipe.surface.surface import Level
 
 GROUND = {
     "plane": {"center": [0, -1, 0], "s": [1, 0, 0], "t": [0, 0, -1], "size": [12, 12]},
@@ -76,6 +79,60 @@ def test_facets_do_not_shade_a_smooth_surface(
     dark = lit & (picture[..., 0] == 0)
     assert np.abs(picture[..., 0] - cosine).max() < 0.01
     assert dark.sum() <= 0.002 * lit.sum()
+
+
+def _resampled_flat(level, times):
+    """The same mesh with smaller faces: vertices stay on the flat facets, normals are interpolated."""
+    vertices, normals, faces = level.vertices, level.normals.astype(float), level.faces
+    for _ in range(times):
+        edges = np.sort(
+            np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1
+        )
+        unique, place = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = len(vertices) + place.reshape(3, -1)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        normals = np.concatenate([normals, normals[unique].mean(axis=1)])
+        a, b, c = faces.T
+        faces = np.concatenate(
+            [np.stack(f, axis=1) for f in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    tangents = np.cross([0.3, 0.8, 0.1], normals)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    return Level(
+        vertices, faces.astype(np.int32), normals.astype(np.float32), tangents.astype(np.float32)
+    )
+
+
+def test_facets_of_a_densely_resampled_coarse_mesh_do_not_shade_it(
+    uv_sphere, scene_file, render_file, tmp_path, monkeypatch
+):
+    from btfpipe.rendering import renderer
+
+    Surface([_resampled_flat(uv_sphere(16, 32)[0], 3)]).save(tmp_path / "dense.npz")
+    lamp = {"type": "directional", "direction": [1, 0.3, -0.2], "irradiance": [np.pi] * 3}
+    film = {"width": 200, "height": 200, "samples": 1, "filter": "box"}
+    path = scene_file([{"mesh": "dense.npz", "albedo": [1, 1, 1]}], lights=[lamp], film=film)
+    direction = np.array([1, 0.3, -0.2]) / np.linalg.norm([1, 0.3, -0.2])
+
+    def dark_share():
+        picture = render_file(path)
+        lit = picture[..., 5:8] @ direction > 0
+        return (lit & (picture[..., 0] == 0)).sum() / lit.sum()
+
+    assert dark_share() <= 0.002
+    monkeypatch.setattr(
+        renderer, "clearance", lambda vertices, faces, normals: np.zeros(len(vertices))
+    )
+    assert dark_share() > 0.01
+
+
+def test_clearance_is_nothing_where_normals_and_facets_agree(uv_sphere):
+    level, *_ = uv_sphere(24, 48)
+    assert clearance(level.vertices, level.faces, level.normals).max() < 1e-3
+    flat = level.vertices * [1, 1, 0]
+    up = np.broadcast_to(np.float32([0, 0, 1]), flat.shape)
+    assert clearance(flat, level.faces, np.ascontiguousarray(up)).max() == 0
 
 
 def test_near_things_still_throw_shadows(scene_file, render_file):
