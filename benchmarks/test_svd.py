@@ -133,7 +133,7 @@ def test_private_memory(benchmark, tmp_path):
     for times in (1, 2, 4):
         path = write_tiled(tmp_path / "s.npz", small, times)
         found = {}
-        for budget in ("192M", "256M", "2G"):
+        for budget in ("256M", "512M", "2G"):
             command = [*run, str(path), "-o", str(out), "--memory", budget]
             found[budget] = round(peak_private_mb(command))
         size = f"{64 * times} x {64 * times} x {PAIRS}"

@@ -28,7 +28,7 @@ _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
 _MOST_ITERATIONS = 8
 _GOOD_ENOUGH = 0.005  # share by which the error may exceed the least possible, by the estimate
-_PROCESS_BYTES = 64 << 20  # Python and its libraries, before any work
+_PROCESS_BYTES = 96 << 20  # Python and its libraries, before any work
 
 
 class SvdModel(Appearance):
@@ -190,6 +190,8 @@ def compress_svd(
             f"{n_terms} terms of a sample of {texels} texels and {sample.n_pairs} pairs; expected 1 to {most},"
             f" the lesser of texels and pairs times channels. Pass --components {most} or fewer."
         )
+    import scipy.linalg  # noqa: F401 (before its BLAS is limited to one thread)
+
     width = min(n_terms + _OVERSAMPLING, most)
     most_passes = (_MOST_ITERATIONS if iterations is None else iterations) + 1
     rng = np.random.default_rng(seed)
@@ -200,10 +202,10 @@ def compress_svd(
     with single_threaded_blas():
         basis = rng.standard_normal((texels, width), np.float32)
         for _ in range(_FIRST_PASSES):
-            basis = passes.power(np.linalg.qr(basis)[0], first)[1]
+            basis = passes.power(_orthonormal(basis), first)[1]
         shift = 0.0
         for iteration in range(most_passes):
-            basis = np.linalg.qr(basis)[0]
+            basis = _orthonormal(basis)
             weights, image, energy = passes.power(basis)
             if not math.isfinite(energy):
                 raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
@@ -236,6 +238,13 @@ def compress_svd(
     }
     passes.finish()
     return model
+
+
+def _orthonormal(columns):
+    """An orthonormal basis of the columns, in single precision throughout (numpy's QR would double it)."""
+    from scipy.linalg import qr
+
+    return np.ascontiguousarray(qr(columns, mode="economic", check_finite=False)[0])
 
 
 def _excess(basis, image, values, turn, energy):
@@ -288,15 +297,19 @@ class _Passes:
         self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
         # basis, its successor and QR's copies; the weights, and in double precision
-        fixed = _PROCESS_BYTES + 4 * width * (4 * self.texels + 12 * sample.n_pairs)
-        # two partial sums; pictures while being decoded
-        each = 4 * width * 2 * self.texels + 36 * self.step * self.texels
-        if fixed + each > memory:
+        vectors = 4 * width * self.texels  # one array of as many columns as the subspace
+        # the weights, also in double precision and turned; then what QR takes, or a pass
+        fixed = _PROCESS_BYTES + 4 * width * 18 * sample.n_pairs
+        each = (
+            2 * vectors + 36 * self.step * self.texels
+        )  # two partial sums; pictures being decoded
+        need = fixed + max(7 * vectors, 2 * vectors + each)
+        if need > memory:
             raise InputError(
-                f"{width} vectors of {self.texels} texels need {(fixed + each) / (1 << 20):.0f} MB; --memory"
-                f" allows {memory / (1 << 20):.0f} MB. Raise it, or ask for fewer components."
+                f"{width} vectors of {self.texels} texels need {math.ceil(need / (1 << 20))} MB; --memory"
+                f" allows {memory >> 20} MB. Raise it, or ask for fewer components."
             )
-        self.at_once = int(min((memory - fixed) // each, 2 * threads))
+        self.at_once = int(min((memory - fixed - 2 * vectors) // each, 2 * threads))
         self.threads = min(threads, self.at_once)
 
     def _groups(self, work, chosen=None):
