@@ -18,12 +18,15 @@ from btfpipe.errors import InputError
 #   triangles    (m, 3)      corners
 #   neighbours   (m, 3)      triangle across the edge that faces each corner, -1 outside
 #   inverse      (m, 6)      origin x, y (the first corner), and the matrix that gives the two other weights
-#   edges        (k, 2)      of the hull
+#   edges        (k, 6)      of the hull: first end x, y, the vector to the second, and that over its length squared
+#   ends         (k, 2)      directions at their ends
+#   border       (g*g+1,), (*,)  edges that can be the nearest of a point in each cell of the grid, as lists
 #   start        (g, g)      triangle under the middle of each cell of a grid over [-1, 1]^2, or near it
 #   first, near  (g*g+1,), (*,)  directions that can be among the nearest five of a point in each cell of the grid
 #   mode         0 barycentric, else the number of nearest directions
 HemisphereTables = namedtuple(
-    "HemisphereTables", "vectors points triangles neighbours inverse edges start first near mode"
+    "HemisphereTables",
+    "vectors points triangles neighbours inverse edges ends border_first border start first near mode",
 )
 
 _GRID = 128
@@ -71,8 +74,8 @@ class Hemisphere:
         start = _nearest_triangle(points, triangles, grid)
         first, near = _candidates(vectors, grid) if mode else (np.zeros(1, np.int32),) * 2
         self.tables = HemisphereTables(
-            vectors, points, triangles, neighbours, _inverses(points, triangles), edges, start,
-            first, near, np.int32(mode),
+            vectors, points, triangles, neighbours, _inverses(points, triangles),
+            *_border(points, edges, grid), start, first, near, np.int32(mode),
         )  # fmt: skip
 
     def weights(self, directions):
@@ -123,6 +126,21 @@ def _nearest_triangle(points, triangles, grid):
         return np.zeros((_GRID, _GRID), np.int32)
     start = cKDTree(points[triangles].mean(axis=1)).query(grid)[1]
     return np.ascontiguousarray(start.reshape(_GRID, _GRID), np.int32)
+
+
+def _border(points, edges, grid):
+    """The hull's edges as (edges, ends), and the lists (first, border) of those near each cell."""
+    origin = points[edges[:, 0]]
+    along = points[edges[:, 1]] - origin
+    squared = np.maximum((along**2).sum(axis=1, keepdims=True), 1e-300)
+    share = ((grid[:, None] - origin) * (along / squared)).sum(axis=2)[..., None]
+    nearest = origin + np.clip(share, 0, 1) * along
+    distance = np.linalg.norm(nearest - grid[:, None], axis=2)
+    # twice the way from the cell's middle to its corner
+    close = distance <= distance.min(axis=1, keepdims=True) + 2 * np.sqrt(2) / _GRID + 1e-9
+    first = np.concatenate([[0], np.cumsum(close.sum(axis=1))]).astype(np.int32)
+    border = np.nonzero(close)[1].astype(np.int32)
+    return np.concatenate([origin, along, along / squared], axis=1), edges, first, border
 
 
 def _candidates(vectors, grid):
@@ -184,7 +202,6 @@ def find(tables, x, y, z, index, weight):
             index,
             weight,
         )
-    points = tables.points
     triangles = tables.triangles
     inverse = tables.inverse
     if triangles.shape[0] > 0:
@@ -218,23 +235,20 @@ def find(tables, x, y, z, index, weight):
     best = np.inf
     index[2] = 0
     weight[2] = 0.0
-    for e in range(tables.edges.shape[0]):
-        a = tables.edges[e, 0]
-        b = tables.edges[e, 1]
-        ux = points[b, 0] - points[a, 0]
-        uy = points[b, 1] - points[a, 1]
-        length = ux * ux + uy * uy
-        along = 0.0
-        if length > 0.0:
-            along = ((px - points[a, 0]) * ux + (py - points[a, 1]) * uy) / length
-            along = min(max(along, 0.0), 1.0)
-        dx = points[a, 0] + along * ux - px
-        dy = points[a, 1] + along * uy - py
-        distance = dx * dx + dy * dy
+    edges = tables.edges
+    cell = i * _GRID + j
+    for at in range(tables.border_first[cell], tables.border_first[cell + 1]):
+        e = tables.border[at]
+        qx = px - edges[e, 0]
+        qy = py - edges[e, 1]
+        along = min(max(qx * edges[e, 4] + qy * edges[e, 5], 0.0), 1.0)
+        qx -= along * edges[e, 2]
+        qy -= along * edges[e, 3]
+        distance = qx * qx + qy * qy
         if distance < best:
             best = distance
-            index[0] = a
-            index[1] = b
+            index[0] = tables.ends[e, 0]
+            index[1] = tables.ends[e, 1]
             weight[0] = 1.0 - along
             weight[1] = along
     return 3
