@@ -17,7 +17,9 @@ TABLE_LIMIT = (
 # labels (rows + side - 1, cols + side - 1) int32: with half a neighbourhood on each side.
 # table (n + 1, n + 1) float32: squared distances of the vectors, from the dot products; empty if unused.
 # image (rows + side - 1, cols + side - 1, d) float32 and vectors (n + 1, d) float32: the Euclidean form; empty if unused.
-Tables = namedtuple("Tables", "side labels table image vectors")
+# flat: views of labels, table and image in one dimension, their width in texels, n + 1, and d, which is what inner loops take:
+# taking arrays out of tuples or reshaping them there costs as much as the search.
+Tables = namedtuple("Tables", "side labels table image vectors flat")
 
 # What the search knows of a level: its tables, those of the next coarser one (side 0: none), its
 # neighbour lists (texels, k), the numbers of rows and cols and the texels whose neighbourhood lies inside, and whether it is toroidal.
@@ -107,7 +109,9 @@ def cut(features, levels):
 def _tables(level, side, toroidal, distance):
     none = np.zeros((0, 0), np.float32)
     if level is None:
-        return Tables(0, np.zeros((0, 0), np.int32), none, np.zeros((0, 0, 0), np.float32), none)
+        return _with_views(
+            0, np.zeros((0, 0), np.int32), none, np.zeros((0, 0, 0), np.float32), none
+        )
     margin = ((side // 2, side // 2),) * 2
     mode = "wrap" if toroidal else "edge"
     labels = np.ascontiguousarray(np.pad(level.labels, margin, mode), np.int32)
@@ -116,9 +120,21 @@ def _tables(level, side, toroidal, distance):
         distance = "gram" if few else "vectors"
     if distance == "gram":
         table = _square_distances(level)
-        return Tables(side, labels, table, np.zeros((0, 0, 0), np.float32), none)
+        return _with_views(side, labels, table, np.zeros((0, 0, 0), np.float32), none)
     vectors = np.ascontiguousarray(level.vectors, np.float32)
-    return Tables(side, labels, none, vectors[labels], vectors)
+    return _with_views(side, labels, none, vectors[labels], vectors)
+
+
+def _with_views(side, labels, table, image, vectors):
+    flat = (
+        labels.ravel(),
+        table.ravel(),
+        image.ravel(),
+        labels.shape[1],
+        table.shape[0],
+        image.shape[2],
+    )
+    return Tables(side, labels, table, image, vectors, flat)
 
 
 def _square_distances(level):

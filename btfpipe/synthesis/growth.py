@@ -17,7 +17,7 @@ from btfpipe.errors import InputError
 from btfpipe.hashing import uniform
 from btfpipe.parallel import blocks, ordered_map
 from btfpipe.sample.orientation import step_to_texels
-from btfpipe.surface.flatten import Flattener, frame_angle
+from btfpipe.surface.flatten import PATCH, Flattener, frame_angle
 from btfpipe.synthesis import search
 from btfpipe.synthesis.coordinate_map import CoordinateMap
 from btfpipe.synthesis.exemplar import cut, exemplar
@@ -31,7 +31,8 @@ Grown = namedtuple("Grown", "row col label")
 
 def grow_over_surface(
     features, surface, texels_per_unit=None, *, full=False, k=11, levels=3, sweeps=SWEEPS, turn=0.0, seed=0,
-    threads=1, coherence=COHERENCE, distance=None, on_progress=None,
+    threads=1, coherence=COHERENCE, distance=None, memory=2 << 30,
+    on_progress=None,
 ):  # fmt: skip
     """Grow a sample over a surface.
 
@@ -55,6 +56,8 @@ def grow_over_surface(
     turn : float
         Angle of the sample's s axis against the vector field, counter-clockwise, radians.
     seed, threads : int
+    memory : int
+        Bytes to stay within; where they allow it, flattened patches are kept for the next sweep.
     distance : str, optional
         ``gram`` or ``vectors``; see `exemplar`.
     on_progress : callable, optional
@@ -101,22 +104,27 @@ def grow_over_surface(
             _inherit(level, mesh, coarse_mesh, below, coarse_sample, sample, state)
             coarse_label = below.label
         done = np.full(n, below is not None)
-        order = breadth_first(mesh, int(seed) % n)
-        flatten = _Flatten(level, mesh, coarse_mesh, sample, order)
+        times = np.zeros(n, np.int64), np.ones(n, np.int64), np.zeros(n, np.float32)
+        tally = np.ones(5, np.int64)
+        jobs = _Jobs(
+            _Flatten(level, mesh, coarse_mesh, sample, breadth_first(mesh, int(seed) % n)), memory
+        )
         for sweep in range(sweeps[0] if below is None else sweeps[1]):
-            tally = np.zeros(5)
+            tally[1:] = 0
             start, searching = time.perf_counter(), 0.0
-            for job in ordered_map(flatten, blocks(n, _BLOCK), threads):
+            for job in jobs.run(threads):
                 tick = time.perf_counter()
                 search.grow(
                     *job, sample, full, below is None and sweep == 0,
-                    np.float32(0.0 if below is None else coherence), *state, done, coarse_label, tally,
+                    np.float32(0.0 if below is None else coherence), *state, done, *times, coarse_label, tally,
                 )  # fmt: skip
                 searching += time.perf_counter() - tick
                 finished += len(job[0])
                 if on_progress is not None:
                     on_progress(finished, total)
-            report.append(summary(i, sweep, n, tally, searching, time.perf_counter() - start))
+            report.append(
+                summary(i, sweep, tally, times[2], searching, time.perf_counter() - start)
+            )
         below, coarse_mesh, coarse_sample = state, mesh, sample
     return CoordinateMap(
         state.row,
@@ -147,14 +155,35 @@ class _Flatten:
         return vertices, patches, *coarse
 
 
-def summary(level, sweep, n, tally, searching, seconds):
-    """What one sweep over `n` elements did; `tally` as in `search.grow`."""
+class _Jobs:
+    """Flattened blocks in order, kept from one sweep to the next if they fit into the memory."""
+
+    def __init__(self, flatten, memory):
+        self.flatten = flatten
+        self.kept = []
+        n = len(flatten.order)
+        side, coarse_side = flatten.sample.fine.side, flatten.sample.coarse.side
+        self.keeps = n * (24 * (side**2 + coarse_side**2) + 12 * PATCH) < memory // 2
+
+    def run(self, threads):
+        if self.kept:
+            yield from self.kept
+            return
+        for job in ordered_map(self.flatten, blocks(len(self.flatten.order), _BLOCK), threads):
+            yield job
+            if self.keeps:
+                self.kept.append(job)
+
+
+def summary(level, sweep, tally, distances, searching, seconds):
+    """What one sweep over a level did; `tally` and `distances` as in `search.grow`."""
+    n = distances.size
     return {
         "level": level,
         "sweep": sweep,
         "elements": n,
         "candidates": float(tally[search.CANDIDATES] / n),
-        "mean_distance": float(tally[search.DISTANCE] / n),
+        "mean_distance": float(distances.mean(dtype=np.float64)),
         "fallbacks": int(tally[search.FALLBACKS]),
         "starts": int(tally[search.STARTS]),
         "changed": float(tally[search.MOVED] / n),

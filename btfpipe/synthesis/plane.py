@@ -14,7 +14,7 @@ from btfpipe.hashing import uniform
 from btfpipe.synthesis.coordinate_map import CoordinateMap
 from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar, is_inside
 from btfpipe.synthesis.growth import COHERENCE, SWEEPS, summary
-from btfpipe.synthesis.search import CANDIDATES, DISTANCE, FALLBACKS, MOVED, STARTS
+from btfpipe.synthesis.search import CANDIDATES, FALLBACKS, MOVED, STARTS
 
 _FAST = {"reassoc", "contract", "nsz"}
 _ROWS = 16  # rows between two reports of progress
@@ -69,21 +69,22 @@ def grow_over_plane(
             coarse = _Canvas(sample.coarse, below, coarse_sample)
         canvas = _Canvas(sample.fine, texel, sample)
         half = side // 2
+        distances = np.zeros((rows, cols), np.float32)
         done = np.full((rows + 2 * half, cols + 2 * half), below is not None)
         for sweep in range(sweeps[0] if below is None else sweeps[1]):
-            tally = np.zeros(5)
+            tally = np.zeros(5, np.int64)
             start = time.perf_counter()
             for first in range(0, rows, _ROWS):
                 last = min(first + _ROWS, rows)
                 grow_rows(
-                    first, last, texel, canvas.labels, canvas.image, coarse.labels, coarse.image, done,
+                    first, last, texel, canvas.labels, canvas.image, coarse.labels, coarse.image, done, distances,
                     sample, full, np.float32(0.0 if below is None else coherence), tally,
                 )  # fmt: skip
                 finished += (last - first) * cols
                 if on_progress is not None:
                     on_progress(finished, total)
             seconds = time.perf_counter() - start
-            report.append(summary(i, sweep, rows * cols, tally, seconds, seconds))
+            report.append(summary(i, sweep, tally, distances, seconds, seconds))
         below, coarse_sample = texel, sample
     return CoordinateMap(
         (texel // sample.cols).reshape(1, -1),
@@ -207,7 +208,7 @@ def _compare(
 
 @njit(cache=True, nogil=True)
 def grow_rows(
-    first, last, texel, labels, image, coarse_labels, coarse_image, done, sample, full, kappa, tally
+    first, last, texel, labels, image, coarse_labels, coarse_image, done, distances, sample, full, kappa, tally
 ):  # fmt: skip
     """Synthesise rows first to last in scanning order; the search is that of `search.grow`.
 
@@ -221,10 +222,12 @@ def grow_rows(
         The same of the coarser level.
     done : (rows + side - 1, cols + side - 1) bool
         What has been synthesised; only this counts.
+    distances : (rows, cols) float32
+        Distance of the texel chosen.
     sample : Exemplar
     full : bool
     kappa : float32
-    tally : (5,) float64
+    tally : (5,) int64
     """
     rows, cols = texel.shape
     side = sample.fine.side
@@ -319,7 +322,7 @@ def grow_rows(
                                 best_distance = distance
                                 best = t
                 tally[CANDIDATES] += found
-                tally[DISTANCE] += best_distance
+                distances[r, c] = best_distance
             if best != texel[r, c]:
                 tally[MOVED] += 1
             texel[r, c] = best

@@ -14,7 +14,7 @@ from numba import njit
 
 from btfpipe.synthesis.exemplar import coarse_texel, is_inside, texel_under, wrapped
 
-CANDIDATES, DISTANCE, FALLBACKS, STARTS, MOVED = range(5)  # places in the tally
+CLOCK, CANDIDATES, FALLBACKS, STARTS, MOVED = range(5)  # places in the tally
 _FAST = {"reassoc", "contract", "nsz"}
 
 
@@ -44,9 +44,7 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
                 total += share[p, j]
             if total < 0.5:
                 share[p, 0] = share[p, 1] = share[p, 2] = 0.0
-                constant[p] = 0.0
-                if n == 0:
-                    blend[p, :] = 0.0
+                constant[p] = 0.0 if n > 0 else -1.0  # the vectors' distance leaves it out
                 continue
             for j in range(3):
                 share[p, j] /= total
@@ -63,6 +61,7 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
             base[p, 1] = b * n
             base[p, 2] = c * n
         else:
+            constant[p] = 0.0
             for i in range(blend.shape[1]):
                 blend[p, i] = (
                     wa * tables.vectors[a, i]
@@ -73,18 +72,16 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _square(r, c, tables, base, share, constant, blend, total, limit):
+def _square(
+    r, c, side, labels, table, image, width, n, depth, base, share, constant, blend, total, limit
+):  # fmt: skip
     """`total` plus the distance of the resampled neighbourhood to that of texel (r, c); given up row by row above `limit`."""
-    side = tables.side
-    if tables.table.shape[0] > 0:
-        width = tables.labels.shape[1]
-        flat = tables.labels.ravel()
-        table = tables.table.ravel()
-        p = 0
-        for i in range(side):
-            run = (r + i) * width + c
+    p = 0
+    for i in range(side):
+        run = (r + i) * width + c
+        if n > 0:
             for j in range(side):
-                t = flat[run + j]
+                t = labels[run + j]
                 total += (
                     share[p, 0] * table[base[p, 0] + t]
                     + share[p, 1] * table[base[p, 1] + t]
@@ -92,38 +89,36 @@ def _square(r, c, tables, base, share, constant, blend, total, limit):
                     - constant[p]
                 )
                 p += 1
-            if total >= limit:
-                return total
-        return total
-    depth = tables.image.shape[2]
-    width = tables.image.shape[1] * depth
-    flat = tables.image.ravel()
-    for i in range(side):
-        run = (r + i) * width + c * depth
-        for j in range(side):
-            p = i * side + j
-            if share[p, 0] + share[p, 1] + share[p, 2] > 0.5:
-                part = np.float32(0.0)
-                for d in range(depth):
-                    step = blend[p, d] - flat[run + j * depth + d]
-                    part += step * step
-                total += part
+        else:
+            for j in range(side):
+                if constant[p] >= 0:
+                    start = (run + j) * depth
+                    part = np.float32(0.0)
+                    for d in range(depth):
+                        step = blend[p, d] - image[start + d]
+                        part += step * step
+                    total += part
+                p += 1
         if total >= limit:
             return total
     return total
 
 
 @njit(cache=True, nogil=True)
-def _two_levels(texel, exemplar, fine, coarse, limit):
+def _two_levels(
+    texel, cols, coarse_side, coarse_sample, coarse, side, sample, fine, limit
+):  # fmt: skip
     """Distance of the vertex's neighbourhoods to those of a texel, the coarser level first."""
-    r = texel // exemplar.cols
-    c = texel - r * exemplar.cols
+    r = texel // cols
+    c = texel - r * cols
     total = np.float32(0.0)
-    if exemplar.coarse.side > 0:
-        total = _square(coarse_texel(r), coarse_texel(c), exemplar.coarse, *coarse, total, limit)
+    if coarse_side > 0:
+        total = _square(
+            coarse_texel(r), coarse_texel(c), coarse_side, *coarse_sample, *coarse, total, limit
+        )
         if total >= limit:
             return total
-    return _square(r, c, exemplar.fine, *fine, total, limit)
+    return _square(r, c, side, *sample, *fine, total, limit)
 
 
 @njit(cache=True, nogil=True)
@@ -131,7 +126,7 @@ def _room(tables):
     """Scratch for one neighbourhood: base, share, constant, blend."""
     pixels = tables.side * tables.side
     return (
-        np.zeros((pixels, 3), np.int64),
+        np.zeros((pixels, 3), np.int32),
         np.zeros((pixels, 3), np.float32),
         np.zeros(pixels, np.float32),
         np.zeros((pixels, tables.vectors.shape[1]), np.float32),
@@ -141,7 +136,7 @@ def _room(tables):
 @njit(cache=True, nogil=True)
 def grow(
     vertices, patches, coarse_vertex, coarse_weight, exemplar, full, skip, kappa, row, col, label, done,
-    coarse_label, tally,
+    visited, moved, distances, coarse_label, tally,
 ):  # fmt: skip
     """Synthesise the given vertices in order.
 
@@ -163,14 +158,22 @@ def grow(
         leads to it, by less in proportion.
     row, col : (all vertices,) float32
         Coordinates; changed in place, as are `label` (int32) and `done` (bool).
+    visited, moved : (all vertices,) int64
+        When each was last synthesised, and when its texel last changed; a vertex with nothing new around it is passed over.
+    distances : (all vertices,) float32
+        Distance of the texel chosen.
     coarse_label : (vertices of the coarser level,) int32
-    tally : (5,) float64
-        Sums: candidates compared, distances of those chosen, fallbacks, starts (vertices that keep their random texel, having
+    tally : (5,) int64
+        The clock of `visited` and `moved`. Counts: candidates compared, fallbacks, starts (vertices that keep their random texel, having
         no synthesised one near), vertices whose texel changed.
     """
     fine = _room(exemplar.fine)
     coarse = _room(exemplar.coarse)
     compared = np.full(exemplar.rows * exemplar.cols, -1, np.int32)  # the last vertex that did
+    pair = (
+        exemplar.cols, exemplar.coarse.side, exemplar.coarse.flat, coarse, exemplar.fine.side,
+        exemplar.fine.flat, fine,
+    )  # fmt: skip
     widest = patches.patch_vertex.shape[1]
     place = np.empty((widest, 2), np.float32)  # where the runs of the patch lead
     owners = np.empty(widest, np.int32)
@@ -180,6 +183,10 @@ def grow(
     low, high, left, right = exemplar.inside
     for i in range(vertices.shape[0]):
         v = vertices[i]
+        if not _is_news(patches.pixel_vertex[i], patches.patch_vertex[i], visited[v], moved):
+            continue
+        tally[CLOCK] += 1
+        visited[v] = tally[CLOCK]
         counting = _resample(
             patches.pixel_vertex[i],
             patches.pixel_weight[i],
@@ -206,6 +213,7 @@ def grow(
         if counting == 0:
             tally[STARTS] += 1
             done[v] = True
+            moved[v] = tally[CLOCK]
             continue
         best = -1
         best_run = -1
@@ -216,7 +224,7 @@ def grow(
             if is_inside(owners[j], exemplar):
                 found += 1
                 penalty = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
-                distance = _two_levels(owners[j], exemplar, fine, coarse, lowest / penalty)
+                distance = _two_levels(owners[j], *pair, lowest / penalty)
                 if distance * penalty < lowest:
                     lowest = distance * penalty
                     best_distance = distance
@@ -232,7 +240,7 @@ def grow(
                         continue
                     compared[texel] = i
                     found += 1
-                    distance = _two_levels(texel, exemplar, fine, coarse, limit)
+                    distance = _two_levels(texel, *pair, limit)
                     if distance < limit:
                         limit = distance
                         best_distance = distance
@@ -247,7 +255,7 @@ def grow(
                     if compared[texel] == i:
                         continue
                     found += 1
-                    distance = _two_levels(texel, exemplar, fine, coarse, limit)
+                    distance = _two_levels(texel, *pair, limit)
                     if distance < limit:
                         limit = distance
                         best_distance = distance
@@ -257,6 +265,7 @@ def grow(
         c0 = best - r0 * exemplar.cols
         if texel_under(row[v], col[v], exemplar) != best:
             tally[MOVED] += 1
+            moved[v] = tally[CLOCK]
         row[v] = r0
         col[v] = c0
         if best_run >= 0:
@@ -265,7 +274,24 @@ def grow(
         label[v] = exemplar.fine.labels[r0 + exemplar.fine.side // 2, c0 + exemplar.fine.side // 2]
         done[v] = True
         tally[CANDIDATES] += found
-        tally[DISTANCE] += best_distance
+        distances[v] = best_distance
+
+
+@njit(cache=True, nogil=True)
+def _is_news(pixel_vertex, patch_vertex, since, moved):
+    """Whether a texel of a neighbourhood or a patch has changed since a time."""
+    for p in range(pixel_vertex.shape[0]):
+        for j in range(3):
+            u = pixel_vertex[p, j]
+            if u >= 0 and moved[u] >= since:
+                return True
+    for j in range(patch_vertex.shape[0]):
+        u = patch_vertex[j]
+        if u < 0:
+            break
+        if moved[u] >= since:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
