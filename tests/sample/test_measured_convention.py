@@ -17,7 +17,7 @@ pytestmark = pytest.mark.measured
 def wallpaper(measured_data, tmp_path_factory):
     path = tmp_path_factory.mktemp("wallpaper") / "wallpaper.sample.npz"
     with ubo.open_measurement(measured_data / "btf/ubo2003_wallpaper_view0") as measurement:
-        ingest(measurement, path, threads=2)
+        ingest(measurement, path, crop=(0, 128, 128, 128), threads=2)
     return Sample.open(path)
 
 
