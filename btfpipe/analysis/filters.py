@@ -17,10 +17,10 @@ _REACH = 3.0  # supports end at three standard deviations
 def base_sigma(rows, cols):
     """Standard deviation of the bank's finest filters, in texels, for pictures of this size.
 
-    Leung and Malik's own, the square root of 2, from 128 texels on; smaller pictures scale it by the square root
-    of their shorter side, down to 0.7, below which a sampled derivative is no longer one.
+    Leung and Malik's own, the square root of 2, from 256 texels on; smaller pictures scale it by the square root
+    of their shorter side (1 at 128), down to 0.7, below which a sampled derivative is no longer one.
     """
-    return float(np.clip(np.sqrt(min(rows, cols) / 64), 0.7, np.sqrt(2)))
+    return float(np.clip(np.sqrt(min(rows, cols) / 128), 0.7, np.sqrt(2)))
 
 
 def leung_malik(sigma):

@@ -9,6 +9,7 @@ from btfpipe.analysis.textons import (
     appearance_vectors,
     cluster,
     eigen_textures,
+    equalise,
     picture_weights,
     representative_pictures,
     texton_features,
@@ -75,6 +76,20 @@ def test_dot_products_and_distances_are_those_of_the_explicit_vectors(model, rng
     assert np.abs(distances(short) - far).max() < 1e-5 * far.max()
 
 
+def test_filters_can_be_made_to_vary_alike(model):
+    """By the same factors as those of the explicit vectors; a filter that sees nothing is not blown up."""
+    explicit = filter_all(model.pictures(slice(None)), toroidal=True)
+    energy = explicit.var(axis=0).sum(axis=(1, 2))
+    textures, angular = eigen_textures(model)
+    vectors = appearance_vectors(textures @ picture_weights(angular), True)
+    factors = equalise(vectors)
+    assert np.allclose(factors, np.sqrt(energy.max() / energy), rtol=1e-4)
+    alike = vectors.reshape(320, 48, -1).var(axis=0).sum(axis=1)
+    assert np.allclose(alike, alike[0], rtol=1e-4)
+    stripes = np.broadcast_to(textures[:1], textures.shape)
+    assert equalise(appearance_vectors(stripes, True)).max() == pytest.approx(50)
+
+
 def test_gram_distances_and_texton_map_are_those_of_the_explicit_appearance_vectors(model):
     explicit = filter_all(model.pictures(slice(None)), toroidal=True).reshape(320, -1)
     textures, angular = eigen_textures(model)
@@ -112,7 +127,7 @@ def test_clustering_in_the_projection_is_as_good_as_in_the_full_space(make_sampl
     full = full.inertia_ / ((explicit - explicit.mean(axis=0)) ** 2).sum()
     textures, angular = eigen_textures(model)
     textons = cluster(appearance_vectors(textures @ picture_weights(angular), True), 60)
-    assert textons.share > 0.99
+    assert textons.share > 0.98
     assert textons.inertia < 1.02 * full
 
 
