@@ -52,6 +52,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, qu
     import time
 
     from btfpipe.formats.images import write_picture
+    from btfpipe.formats.meshes import read_mesh
     from btfpipe.rendering.renderer import LAYERS
     from btfpipe.rendering.renderer import render as render_scene
     from btfpipe.rendering.scene import load_scene
@@ -60,7 +61,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, qu
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
     film = {"width": width, "height": height, "samples": samples}
     start = time.perf_counter()
-    loaded = load_scene(scene, bindings, film=film)
+    loaded = load_scene(scene, bindings, film=film, read_mesh=read_mesh)
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:
