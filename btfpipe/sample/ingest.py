@@ -171,7 +171,8 @@ def ingest(
             facts["drift"] = float(gain.max() / gain.min() - 1)
         facts |= _plain_facts(measurement)
         writer.facts["source"] = facts
-    return facts
+    said = ("toroidal", "texels_per_mm", "absolute")
+    return facts | {key: getattr(sample, key) for key in said}
 
 
 def drift_gain(mean):

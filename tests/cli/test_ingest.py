@@ -99,6 +99,11 @@ def test_the_summary_counts_and_lists_strays_and_mislabelled(btfpipe, make_measu
     assert summary["n_strays"] == 2
     assert summary["strays"] == ["cover.jpg", "notes.txt"]
     assert summary["n_mislabelled"] == 1
+    assert (summary["toroidal"], summary["absolute"], summary["texels_per_mm"]) == (
+        False,
+        False,
+        None,
+    )
     assert summary["mislabelled"][0].endswith("tl030 pl090 tv045 pv180.jpg")
     np.testing.assert_array_equal(Sample.open(tmp_path / "s.npz").codes, codes.reshape(6, 6, 8, 3))
 
