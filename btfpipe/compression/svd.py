@@ -28,7 +28,7 @@ _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
 _MOST_ITERATIONS = 8
 _GOOD_ENOUGH = 0.005  # share by which the error may exceed the least possible, by the estimate
-_PROCESS_BYTES = 96 << 20  # Python and its libraries, before any work
+_PROCESS_BYTES = 104 << 20  # Python and its libraries, before any work
 
 
 class SvdModel(Appearance):
@@ -221,7 +221,7 @@ def compress_svd(
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
         root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
-        texture = (basis @ turn * root).reshape(*sample.shape, n_terms)
+        texture = (basis @ (turn * root).astype(np.float32)).reshape(*sample.shape, n_terms)
         angular = (flat @ turn / root).reshape(sample.n_pairs, 3, n_terms)
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
@@ -303,13 +303,13 @@ class _Passes:
         each = (
             2 * vectors + 36 * self.step * self.texels
         )  # two partial sums; pictures being decoded
-        need = fixed + max(7 * vectors, 2 * vectors + each)
+        need = fixed + max(7 * vectors, 4 * vectors + each)
         if need > memory:
             raise InputError(
                 f"{width} vectors of {self.texels} texels need {math.ceil(need / (1 << 20))} MB; --memory"
                 f" allows {memory >> 20} MB. Raise it, or ask for fewer components."
             )
-        self.at_once = int(min((memory - fixed - 2 * vectors) // each, 2 * threads))
+        self.at_once = int(min((memory - fixed - 4 * vectors) // each, 2 * threads))
         self.threads = min(threads, self.at_once)
 
     def _groups(self, work, chosen=None):

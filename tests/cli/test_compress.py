@@ -46,7 +46,7 @@ def test_precision_decides_the_bytes(btfpipe, sample_file, tmp_path):
 def test_same_bytes_for_any_threads_and_other_bytes_for_another_seed(
     btfpipe, sample_file, tmp_path
 ):
-    runs = {"a": ("-t", 1), "b": ("-t", 2), "c": ("-t", 2, "--memory", "99M"), "d": ("--seed", 7)}
+    runs = {"a": ("-t", 1), "b": ("-t", 2), "c": ("-t", 2, "--memory", "109M"), "d": ("--seed", 7)}
     for name, options in runs.items():
         btfpipe(
             "compress",
