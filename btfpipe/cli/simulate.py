@@ -29,7 +29,7 @@ _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 @click.option(
     "--quality",
     type=click.IntRange(1, 100),
-    default=95,
+    default=92,
     show_default=True,
     help="Of JPEG, in per cent.",
 )

@@ -1,5 +1,6 @@
 """OBJ as a meso-structure: positions, polygons cut into triangles, and the material name of each."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def read_parts(path):
                 index = [i - 1 if i > 0 else len(vertices) + i for i in index]
                 if len(index) < 3 or min(index) < 0:
                     raise ValueError("three vertices or more expected, numbered from 1")
-                faces += [[index[0], a, b] for a, b in zip(index[1:-1], index[2:], strict=True)]
+                faces += [[index[0], a, b] for a, b in pairwise(index[1:])]
                 part += [names.setdefault(current, len(names))] * (len(index) - 2)
         except ValueError as error:
             raise InputError(f"{path}: line {number} cannot be read ({error}).") from error

@@ -19,7 +19,7 @@ from btfpipe.simulation.reflectance import (
     visible_normal,
 )
 from btfpipe.simulation.tracing import Tracer
-from btfpipe.simulation.transport import OFFSET, Gatherer, interpolate
+from btfpipe.simulation.transport import OFFSET, ROUGHNESS_SEEN, Gatherer, interpolate
 
 _RAYS = 1 << 16  # camera rays traced at a time: bounds the memory
 _EYE_DRAWS = 1 << 32  # keeps the draws of the eye's rays apart from those of the vertices
@@ -137,9 +137,7 @@ class Goniometer:
         patch, faces = self.patch, self._table_faces
         face, u, v = (a[seen] for a in hits[:3])
         points = np.zeros((len(seen), 10), np.float32)
-        _interpolate_all(
-            faces, patch.normals, patch.albedo, patch.roughness, patch.f0, face, u, v, points
-        )
+        _seen(faces, patch.normals, patch.albedo, patch.roughness, patch.f0, face, u, v, points)
         rays = rays[seen]
         return rays, face, u, v, faces, points, directions[rays]
 
@@ -153,9 +151,11 @@ def _pattern(samples):
 
 
 @njit(cache=True, nogil=True)
-def _interpolate_all(faces, normals, albedo, roughness, f0, face, u, v, points):
+def _seen(faces, normals, albedo, roughness, f0, face, u, v, points):
+    """What mirrored rays meet, no smoother than ROUGHNESS_SEEN."""
     for k in range(face.shape[0]):
         interpolate(faces, normals, albedo, roughness, f0, face[k], u[k], v[k], points[k])
+        points[k, 6] = max(points[k, 6], ROUGHNESS_SEEN)
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ from btfpipe.simulation.meshes import MESHES
 from btfpipe.simulation.noise import fractal_noise
 from btfpipe.simulation.patch import Patch, height_field
 from btfpipe.simulation.reliefs import RELIEFS, Relief
-from btfpipe.simulation.tiles import TileMesh, smooth_corners
+from btfpipe.simulation.tiles import TileMesh, smooth_corners, split
 
 _GREY = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear Rec. 709
 
@@ -36,7 +36,8 @@ def build_patch(spec, files):
     rng = np.random.default_rng([spec["seed"], 0])
     fine = spec["vertices_per_texel"]
     if kind == "obj":
-        return _tiled(spec, files, *_read_mesh(files, **parameters), size)
+        mesh = split(_read_mesh(files, parameters["file"]), 2 / (fine * scale))
+        return _tiled(spec, files, mesh, parameters["crease_deg"], size)
     if kind in MESHES:
         return _tiled(
             spec, files, MESHES[kind](size, 2 / (fine * scale), rng, **parameters), 180, size
@@ -54,10 +55,10 @@ def build_patch(spec, files):
     return height_field(relief.height * scale, albedo, roughness, f0, (rows, cols))
 
 
-def _read_mesh(files, *, file, crease_deg):
+def _read_mesh(files, file):
     vertices, faces, part, names = files.mesh(file)
     flat = np.zeros(len(vertices), int)
-    return TileMesh(vertices, faces, part, flat, flat, names), crease_deg
+    return TileMesh(vertices, faces, part, flat, flat, names)
 
 
 def _tiled(spec, files, mesh, crease_deg, size):

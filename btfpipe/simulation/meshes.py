@@ -58,7 +58,7 @@ def _tube(curve, period, radius, around, twist):
     r = radius * (0.8 + 0.2 * groove)
     ring = side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]
     vertices = curve[:-1, None] + r[..., None] * ring
-    vertices = np.concatenate([vertices, vertices[:1] + [period, 0, 0]])
+    vertices = np.concatenate([vertices, vertices[:1] + np.array([period, 0, 0])])
     fibre = np.concatenate([groove, groove[:1]]) * 1.6 - 1
     i, j = np.meshgrid(np.arange(n), np.arange(around), indexing="ij")
     a, b = i * around + j, i * around + (j + 1) % around

@@ -51,6 +51,52 @@ def joined(pieces, parts):
     return TileMesh(*(np.concatenate(a) for a in (vertices, faces, part, element, fibre)), parts)
 
 
+def split(mesh, longest):
+    """Cut edges at their middle until none is longer than `longest` (mm).
+
+    Light is cached at vertices, so triangles must not be larger than what light varies over.
+    """
+    while True:
+        sides = np.roll(mesh.vertices[mesh.faces], -1, axis=1) - mesh.vertices[mesh.faces]
+        # rounded, so that both sides of an edge and its twin across the border decide alike
+        long = np.linalg.norm(sides, axis=2).round(9) > longest
+        if not long.any():
+            return mesh
+        start, end = mesh.faces, np.roll(mesh.faces, -1, axis=1)
+        n = len(mesh.vertices)
+        key = np.minimum(start, end) * n + np.maximum(start, end)
+        cut, where = np.unique(key[long], return_inverse=True)
+        middle = np.full(mesh.faces.shape, -1)
+        middle[long] = n + where
+        p, q = np.divmod(cut, n)
+
+        # turn each triangle so that its uncut edges come last: patterns (x..), (xx.), (xxx)
+        count = long.sum(axis=1)
+        first = np.argmax(long & ~np.roll(long, 1, axis=1), axis=1)
+        turn = (first[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(mesh.faces, turn, axis=1).T
+        x, y, z = np.take_along_axis(middle, turn, axis=1).T
+        pieces, owner = [], []
+        for cuts, triangles in (
+            (0, [(a, b, c)]),
+            (1, [(a, x, c), (x, b, c)]),
+            (2, [(a, x, c), (x, y, c), (x, b, y)]),
+            (3, [(a, x, z), (x, b, y), (z, y, c), (x, y, z)]),
+        ):
+            at = np.flatnonzero(count == cuts)
+            for triangle in triangles:
+                pieces.append(np.stack(triangle, axis=1)[at])
+                owner.append(at)
+        mesh = TileMesh(
+            np.concatenate([mesh.vertices, (mesh.vertices[p] + mesh.vertices[q]) / 2]),
+            np.concatenate(pieces),
+            mesh.part[np.concatenate(owner)],
+            np.concatenate([mesh.element, mesh.element[p]]),
+            np.concatenate([mesh.fibre, (mesh.fibre[p] + mesh.fibre[q]) / 2]),
+            mesh.parts,
+        )
+
+
 def smooth_corners(mesh, size, crease_deg):
     """Which corners share a shading normal, and the normals.
 

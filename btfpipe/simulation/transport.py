@@ -9,10 +9,14 @@ import numpy as np
 from numba import njit
 
 from btfpipe import hashing, parallel
-from btfpipe.simulation.reflectance import average_fresnel, frame, lobes, reflect
+from btfpipe.simulation.reflectance import frame, lobes, reflect
 
 OFFSET = 2e-3  # texels by which rays start above the surface
 _BLOCK = 1024  # vertices gathered at a time
+
+# A point that is seen by way of another one reflects at least this roughly: narrow lobes there are found by so few paths
+# that they would show as sparks, not as caustics (path space regularisation, Kaplanyan and Dachsbacher 2013).
+ROUGHNESS_SEEN = 0.4
 
 
 class Gatherer:
@@ -143,6 +147,7 @@ def _first_bounce(
     corner = np.empty((n, 3), np.int32)
     for k in range(n):
         interpolate(table_faces, normals, albedo, roughness, f0, face[k], u[k], v[k], points[k])
+        points[k, 6] = max(points[k, 6], ROUGHNESS_SEEN)
         for c in range(3):
             corner[k, c] = table_faces[face[k], c]
     for light in range(lights.shape[0]):
@@ -184,6 +189,3 @@ def interpolate(table_faces, normals, albedo, roughness, f0, face, u, v, out):
     for k in range(3):
         out[k] /= length
     out[6] = w * roughness[a] + u * roughness[b] + v * roughness[c]
-
-
-__all__ = ["OFFSET", "Gatherer", "average_fresnel", "average_fresnel_of", "interpolate"]
