@@ -4,6 +4,7 @@ Nothing is unpacked; a zip's members are read by their place in the file, on any
 """
 
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -11,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from btfpipe.errors import InputError
 
+COPY = re.compile(r" \(member \d+ of that name\)$")  # tells members of one name apart
 _MAX_MEMBER = 2**30  # bytes of one picture, far above any real one
 _MAX_RATIO = 1032  # of deflate: more is a lie
 

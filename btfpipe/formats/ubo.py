@@ -14,7 +14,7 @@ import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import open_archive
+from btfpipe.formats.archive import COPY, open_archive
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
 from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
@@ -67,12 +67,12 @@ class Listing:
     def __init__(self, archive):
         pairs, self.duplicates, self.strays, self.settings = {}, [], [], {}
         for name in archive.names:
-            base = PurePosixPath(name).name
+            base = COPY.sub("", PurePosixPath(name).name)
             hidden = base.startswith(".") or "__MACOSX/" in name
             angles = parse_name(base)
             if base == SETTINGS:
                 self.settings = _settings(archive, name)
-            elif angles is None or hidden or not base.lower().split(" (")[0].endswith(_ENDINGS):
+            elif angles is None or hidden or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)
             else:
                 light, view = (_direction(a, archive.label(name)) for a in angles)

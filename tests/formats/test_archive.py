@@ -105,3 +105,28 @@ def test_a_file_that_vanished_from_a_folder_is_named(tmp_path):
         (tmp_path / "a.jpg").unlink()
         with pytest.raises(InputError, match=r"a.jpg: cannot be read"):
             folder.read("a.jpg")
+
+
+def test_a_damaged_local_header_is_found(tmp_path):
+    path = pack(tmp_path / "a.zip", {"a.jpg": b"x" * 200})
+    path.write_bytes(b"XX" + path.read_bytes()[2:])
+    with (
+        open_archive(path) as archive,
+        pytest.raises(InputError, match=r"a\.jpg: truncated or damaged"),
+    ):
+        archive.read("a.jpg")
+
+
+def test_a_broken_deflate_stream_is_found(tmp_path, rng):
+    path = pack(tmp_path / "a.zip", {"a.jpg": rng.bytes(300) * 3}, zipfile.ZIP_DEFLATED)
+    data = bytearray(path.read_bytes())
+    data[40:60] = b"\xff" * 20
+    path.write_bytes(data)
+    with open_archive(path) as archive, pytest.raises(InputError, match=r"a\.jpg: damaged"):
+        archive.read("a.jpg")
+
+
+def test_another_packing_method_is_named(tmp_path):
+    path = pack(tmp_path / "a.zip", {"a.jpg": b"x" * 200}, zipfile.ZIP_LZMA)
+    with open_archive(path) as archive, pytest.raises(InputError, match=r"packed by method 14"):
+        archive.read("a.jpg")

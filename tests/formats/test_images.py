@@ -153,3 +153,10 @@ def test_layers_without_colour_are_refused(tmp_path, rng):
 def test_equal_pictures_are_equal_bytes(rng):
     picture = rng.random((5, 6, 3)).astype(np.float16)
     assert encode_picture(picture, ".exr") == encode_picture(picture, ".exr")
+
+
+def test_no_room_for_a_decoded_picture_is_said_of_that_folder(rng):
+    with Decoder() as decoder:
+        decoder._folder += "/gone"
+        with pytest.raises(InputError, match=r"gone: no room for a decoded picture"):
+            decoder.decode(encode_picture(rng.integers(0, 9, (4, 4, 3), np.uint8), ".png"), "a.png")

@@ -1,4 +1,5 @@
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -165,3 +166,25 @@ def test_the_listing_counts_what_is_missing(make_measurement):
     path, _ = make_measurement(change=lambda m: m.pop(next(iter(m))))
     with open_archive(path) as archive:
         assert ubo.Listing(archive).missing() == [((0, 0), (0, 0))]
+
+
+def test_copies_made_by_a_browser_are_not_lost(make_measurement):
+    def change(members):
+        first = next(iter(members))
+        members[first.replace(".png", " (1).png")] = members[first]
+
+    path, _ = make_measurement(change=change)
+    with pytest.raises(InputError, match=r"there twice .*pv000\.png.*pv000 \(1\)\.png"):
+        with ubo.open_measurement(path):
+            pass
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_members_of_one_name_are_a_pair_there_twice(make_measurement):
+    path, _ = make_measurement()
+    with zipfile.ZipFile(path, "a") as archive:
+        name = archive.namelist()[0]
+        archive.writestr(name, b"x")
+    with pytest.raises(InputError, match=r"there twice .*member 2 of that name"):
+        with ubo.open_measurement(path):
+            pass
