@@ -281,9 +281,9 @@ def _read_stl(path, data):
 
 
 def write_obj(path, vertices, faces):
-    """Write a mesh as OBJ with 6 decimals; the same mesh gives the same bytes."""
+    """Write a mesh as OBJ with 5 decimals; the same mesh gives the same bytes."""
     from btfpipe.store import whole
 
     with whole(path, "w") as file:
-        file.writelines(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in vertices)
+        file.writelines(f"v {x:.5f} {y:.5f} {z:.5f}\n" for x, y, z in vertices)
         file.writelines(f"f {a} {b} {c}\n" for a, b, c in np.asarray(faces) + 1)

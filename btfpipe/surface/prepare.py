@@ -1,5 +1,6 @@
 """From a raw mesh to a Surface: clean, resample, give frames, stack levels."""
 
+import itertools
 import os
 
 import numpy as np
@@ -71,7 +72,7 @@ def prepare(
     os.environ.setdefault("IGL_NUM_THREADS", str(threads))
     vertices, faces, repairs = clean(vertices, faces, name)
     source = smooth_input(vertices, faces, crease_deg, PHONG_ALPHA if smooth else 0.0)
-    euler, loops, component = describe(faces, len(vertices))
+    euler, loops, _ = describe(faces, len(vertices))
     levels = []
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
@@ -88,7 +89,7 @@ def prepare(
             )
         )  # fmt: skip
     fallbacks = []
-    for level, coarser in zip(levels, levels[1:], strict=False):
+    for level, coarser in itertools.pairwise(levels):
         level.parent_face, level.parent_weights, missed = parents(
             level.vertices, level.normals, coarser.vertices, coarser.faces
         )
