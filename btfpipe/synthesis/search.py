@@ -20,14 +20,13 @@ _FAST = {"reassoc", "contract", "nsz"}
 
 @njit(cache=True, nogil=True)
 def _resample(vertex, weight, skip, label, done, tables, base, share, constant, blend):
-    """Blend the textons under each pixel of a neighbourhood; returns the number of pixels that count.
+    """Blend the textons under each pixel of a neighbourhood.
 
     Pixels that no triangle covers carry the default texton. With `skip`, vertices not yet synthesised are left out, and with
     them the pixels that mostly hang on them.
     """
     default = max(tables.table.shape[0], tables.vectors.shape[0]) - 1
     n = tables.table.shape[0]
-    counting = 0
     for p in range(vertex.shape[0]):
         if vertex[p, 0] < 0:
             base[p, 0] = base[p, 1] = base[p, 2] = default
@@ -48,7 +47,6 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
                 continue
             for j in range(3):
                 share[p, j] /= total
-        counting += 1
         a, b, c = base[p, 0], base[p, 1], base[p, 2]
         wa, wb, wc = share[p, 0], share[p, 1], share[p, 2]
         if n > 0:
@@ -68,7 +66,6 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
                     + wb * tables.vectors[b, i]
                     + wc * tables.vectors[c, i]
                 )
-    return counting
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -187,7 +184,7 @@ def grow(
             continue
         tally[CLOCK] += 1
         visited[v] = tally[CLOCK]
-        counting = _resample(
+        _resample(
             patches.pixel_vertex[i],
             patches.pixel_weight[i],
             skip,
@@ -210,7 +207,7 @@ def grow(
                 place[runs, 1] = col[u] + patches.patch_step[i, j, 1]
                 runs += 1
         n = _gather(place[:runs], exemplar, compared, i, owners, support, fraction)
-        if counting == 0:
+        if runs == 0:
             tally[STARTS] += 1
             done[v] = True
             moved[v] = tally[CLOCK]
