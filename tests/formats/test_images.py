@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 
@@ -160,3 +162,21 @@ def test_no_room_for_a_decoded_picture_is_said_of_that_folder(rng):
         decoder._folder += "/gone"
         with pytest.raises(InputError, match=r"gone: no room for a decoded picture"):
             decoder.decode(encode_picture(rng.integers(0, 9, (4, 4, 3), np.uint8), ".png"), "a.png")
+
+
+@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="needs files without a name")
+def test_what_a_killed_process_would_leave_takes_no_memory(rng):
+    with Decoder() as decoder:
+        decoder.decode(encode_picture(rng.integers(0, 9, (4, 4, 3), np.uint8), ".png"), "a.png")
+        (left,) = os.scandir(decoder._folder)
+        assert left.is_symlink()
+
+
+def test_without_nameless_files_plain_ones_serve(rng, monkeypatch):
+    monkeypatch.delattr(os, "memfd_create", raising=False)
+    pictures = rng.integers(0, 255, (2, 30, 40, 3), np.uint8)
+    pictures[1] = 0  # much smaller than the first: nothing of that may be left in the file
+    with Decoder() as decoder:
+        for picture in pictures:
+            decoded = decoder.decode(encode_picture(picture, ".png"), "a.png")
+            np.testing.assert_array_equal(decoded.values, picture)
