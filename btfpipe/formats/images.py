@@ -269,9 +269,11 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
         spec.attribute("compression", "zip")
     else:
         spec.attribute("oiio:UnassociatedAlpha", 1)  # or the library divides colours by alpha
-    # no DateTime or Software: equal pictures are equal bytes
+    # no clock time: equal pictures are equal bytes. The writers of EXR and TIFF would put the time in where there is none
     for key in ("DateTime", "Software"):
         spec.erase_attribute(key)
+    if suffix in (".exr", ".tif", ".tiff"):
+        spec.attribute("DateTime", "1980:01:01 00:00:00")
     out = oiio.ImageOutput.create("picture" + suffix)
     if out is None:
         raise InputError(f"{suffix}: no picture format that can be written; use .exr or .png.")
