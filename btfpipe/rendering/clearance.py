@@ -1,7 +1,7 @@
 """How far shadow rays must start from a surface whose shading normals are smoother than its facets."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 _ITERATIONS = (
     100  # reaches about ten edges far: the facets of an input mesh seen in a dense resampling of it
@@ -50,10 +50,10 @@ def clearance(vertices, faces, normals):
     return _FACTOR * height
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _steps(vertices, normals, first, after, step):
     """Sum over the neighbours of how far they lie above the vertex along the edge's mean normal."""
-    for i in prange(len(vertices)):
+    for i in range(len(vertices)):
         total = 0.0
         for e in range(first[i], first[i + 1]):
             j = after[e]
@@ -62,20 +62,20 @@ def _steps(vertices, normals, first, after, step):
         step[i] = total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _relax(step, first, after, height, out):
     """One Jacobi iteration of the heights."""
-    for i in prange(len(height)):
+    for i in range(len(height)):
         total = step[i]
         for e in range(first[i], first[i + 1]):
             total += height[after[e]]
         out[i] = total / (first[i + 1] - first[i] + _SCREENING)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _widen(first, after, height, out):
     """The largest height of a vertex and its neighbours."""
-    for i in prange(len(height)):
+    for i in range(len(height)):
         most = height[i]
         for e in range(first[i], first[i + 1]):
             most = max(most, height[after[e]])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from btfpipe.errors import InputError
 from btfpipe.sample.orientation import step_to_texels
@@ -133,7 +133,7 @@ def dress(vertices, faces, normals, tangents, coordinates, appearance, interpola
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def find_coherent(
     vertices, faces, normals, axis, row, col, texels_per_unit, rows, cols, toroidal, coherent
 ):
@@ -143,7 +143,7 @@ def find_coherent(
     must differ by that step, and the frames' turn against each other must move no end of it by more than the
     tolerance. Fills `coherent` (faces,) bool.
     """
-    for f in prange(len(faces)):
+    for f in range(len(faces)):
         good = True
         for k in range(3):
             a = faces[f, k]
