@@ -51,8 +51,8 @@ def read_mesh(path):
     vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
     if not len(polygons):
         raise InputError(
-            f"{path}: holds {len(vertices)} vertices and no faces; expected a triangle mesh."
-            " Reconstruct a surface from points first."
+            f"{path}: holds {len(vertices) or 'no'} vertices and no faces; expected a triangle mesh."
+            + (" Reconstruct a surface from the points first." if len(vertices) else "")
         )
     return vertices, _triangles(path, polygons, len(vertices), where)
 

@@ -128,7 +128,7 @@ def stroke_field(vertices, faces, normals, strokes):
     upright = np.einsum("kx,kx->k", wanted, normals[vertex])
     wanted = wanted - upright[:, None] * normals[vertex]
     flat = np.linalg.norm(wanted, axis=1)
-    for i in np.flatnonzero(flat <= 0.05 * length):
+    for i in np.flatnonzero(flat <= 0.1 * length):
         raise InputError(
             f"stroke {i + 1}: its vector stands on the surface; give one that lies along it."
         )

@@ -1,0 +1,100 @@
+"""Small meshes made in code."""
+
+import importlib.util
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+_MAKER = Path(__file__).parents[2] / "data-sample" / "make_meshes.py"
+
+
+def make_meshes():
+    """The module that makes the sample meshes."""
+    spec = importlib.util.spec_from_file_location("make_meshes", _MAKER)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def sphere(halvings=2):
+    vertices, faces = make_meshes().icosphere(halvings)
+    return vertices, faces.astype(np.int32)
+
+
+def grid(rows=9, cols=13, width=1.5, height=1.0):
+    """An open rectangle in the plane y = 0, seen from above."""
+    x, z = np.meshgrid(np.linspace(0, width, cols), np.linspace(0, height, rows))
+    vertices = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
+    i = np.arange(rows * cols).reshape(rows, cols)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    return vertices, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]).astype(
+        np.int32
+    )
+
+
+def torus(around=24, across=12, outer=1.0, inner=0.4):
+    """A torus about the y axis."""
+    u, w = np.meshgrid(
+        2 * np.pi * np.arange(around) / around,
+        2 * np.pi * np.arange(across) / across,
+        indexing="ij",
+    )
+    reach = outer + inner * np.cos(w)
+    vertices = np.stack([reach * np.cos(u), inner * np.sin(w), -reach * np.sin(u)], 2).reshape(
+        -1, 3
+    )
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    k, m = (i + 1) % around, (j + 1) % across
+    a, b, c, d = (
+        x.ravel() for x in (i * across + j, k * across + j, k * across + m, i * across + m)
+    )
+    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(
+        np.int32
+    )
+
+
+def boxes(solid):
+    """The surface of the cubes of a solid (x, y, z) array of booleans, two triangles a square."""
+    solid = np.pad(solid, 1)
+    quads = []
+    for axis in range(3):
+        for side in (-1, 1):
+            free = solid & ~np.roll(solid, -side, axis)
+            for cell in np.argwhere(free):
+                corner = cell + (np.eye(3, dtype=int)[axis] if side > 0 else 0)
+                u, w = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+                quad = [corner, corner + u, corner + u + w, corner + w]
+                quads.append(quad if side > 0 else quad[::-1])
+    points, index = np.unique(np.array(quads).reshape(-1, 3), axis=0, return_inverse=True)
+    a, b, c, d = index.reshape(-1, 4).T
+    return points.astype(float), np.concatenate(
+        [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
+    ).astype(np.int32)
+
+
+def double_ring():
+    """A slab with two holes: genus 2."""
+    solid = np.ones((5, 3, 1), bool)
+    solid[1, 1] = solid[3, 1] = False
+    return boxes(solid)
+
+
+def cube():
+    return boxes(np.ones((1, 1, 1), bool))
+
+
+def obj(path, vertices, faces):
+    """Write an OBJ and return its path."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in np.asarray(vertices, float).tolist()]
+    lines += ["f " + " ".join(str(c + 1) for c in face) for face in np.asarray(faces).tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="session")
+def shapes():
+    """The makers of this file by name."""
+    names = ("make_meshes", "sphere", "grid", "torus", "boxes", "double_ring", "cube", "obj")
+    return SimpleNamespace(**{name: globals()[name] for name in names})
