@@ -14,19 +14,18 @@ from btfpipe.errors import InputError
 
 # What a compiled kernel needs of a Hemisphere; all in the stereographic plane but `vectors`.
 #   vectors      (n, 3)      the directions
-#   points       (n, 2)      their projections
 #   triangles    (m, 3)      corners
 #   neighbours   (m, 3)      triangle across the edge that faces each corner, -1 outside
 #   inverse      (m, 6)      origin x, y (the first corner), and the matrix that gives the two other weights
 #   edges        (k, 6)      of the hull: first end x, y, the vector to the second, and that over its length squared
 #   ends         (k, 2)      directions at their ends
 #   border       (g*g+1,), (*,)  edges that can be the nearest of a point in each cell of the grid, as lists
-#   start        (g, g)      triangle under the middle of each cell of a grid over [-1, 1]^2, or near it
+#   start        (g*g,)      triangle under the middle of each cell of a grid over [-1, 1]^2, or near it
 #   first, near  (g*g+1,), (*,)  directions that can be among the nearest five of a point in each cell of the grid
 #   mode         0 barycentric, else the number of nearest directions
 HemisphereTables = namedtuple(
     "HemisphereTables",
-    "vectors points triangles neighbours inverse edges ends border_first border start first near mode",
+    "vectors triangles neighbours inverse edges ends border_first border start first near mode",
 )
 
 _GRID = 128
@@ -67,14 +66,13 @@ class Hemisphere:
         self.directions = vectors
         self.method = method
         points = vectors[:, :2] / (1 + vectors[:, 2:])
-        triangles, neighbours, edges = _triangulate(points)
         mode = {"barycentric": 0, "four": 4, "nearest": 1}[method]
         cell = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
         grid = np.stack(np.meshgrid(cell, cell, indexing="ij"), axis=-1).reshape(-1, 2)
-        start = _nearest_triangle(points, triangles, grid)
+        triangles, neighbours, edges, start = _triangulate(points, grid)
         first, near = _candidates(vectors, grid) if mode else (np.zeros(1, np.int32),) * 2
         self.tables = HemisphereTables(
-            vectors, points, triangles, neighbours, _inverses(points, triangles),
+            vectors, triangles, neighbours, _inverses(points, triangles),
             *_border(points, edges, grid), start, first, near, np.int32(mode),
         )  # fmt: skip
 
@@ -83,30 +81,34 @@ class Hemisphere:
         queries = np.ascontiguousarray(directions, dtype=np.float64)
         index = np.zeros((len(queries), 4), np.int32)
         weight = np.zeros((len(queries), 4))
-        _find_all(self.tables, queries, index, weight)
+        find(self.tables, queries, index, weight)
         return index, weight
 
 
-def _triangulate(points):
-    """Delaunay triangles, their neighbours and the hull's edges; degenerate sets have edges only."""
-    from scipy.spatial import Delaunay, QhullError
+def _triangulate(points, grid):
+    """Delaunay triangles, their neighbours, the hull's edges, and where a walk to each cell of the grid starts.
+
+    Degenerate sets have edges only.
+    """
+    from scipy.spatial import Delaunay, QhullError, cKDTree
 
     none = np.zeros((0, 3), np.int32)
     if len(points) >= 3:
         try:
             mesh = Delaunay(points)
-            return (
-                np.ascontiguousarray(mesh.simplices, np.int32),
-                np.ascontiguousarray(mesh.neighbors, np.int32),
-                np.ascontiguousarray(mesh.convex_hull, np.int32),
-            )
         except QhullError:
             pass  # all on one line
+        else:
+            # under the cell's middle, or outside the hull the triangle with the nearest centre
+            start = mesh.find_simplex(grid)
+            nearest = cKDTree(points[mesh.simplices].mean(axis=1)).query(grid)[1]
+            start = np.where(start >= 0, start, nearest)
+            parts = (mesh.simplices, mesh.neighbors, mesh.convex_hull, start)
+            return tuple(np.ascontiguousarray(part, np.int32) for part in parts)
     axis = points - points.mean(axis=0)
     order = np.argsort(axis @ np.linalg.svd(axis)[2][0], kind="stable").astype(np.int32)
-    if len(order) == 1:
-        return none, none, np.array([[0, 0]], np.int32)
-    return none, none, np.ascontiguousarray(np.stack([order[:-1], order[1:]], axis=1))
+    edges = np.array([[0, 0]]) if len(order) == 1 else np.stack([order[:-1], order[1:]], axis=1)
+    return none, none, np.ascontiguousarray(edges, np.int32), np.zeros(len(grid), np.int32)
 
 
 def _inverses(points, triangles):
@@ -116,16 +118,6 @@ def _inverses(points, triangles):
     area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])[:, None]
     rows = np.concatenate([v[:, 1:], -v[:, :1], -u[:, 1:], u[:, :1]], axis=1)
     return np.ascontiguousarray(np.concatenate([a, rows / area], axis=1))
-
-
-def _nearest_triangle(points, triangles, grid):
-    """For each cell of the grid the triangle whose centre is nearest: walks start there."""
-    from scipy.spatial import cKDTree
-
-    if len(triangles) == 0:
-        return np.zeros((_GRID, _GRID), np.int32)
-    start = cKDTree(points[triangles].mean(axis=1)).query(grid)[1]
-    return np.ascontiguousarray(start.reshape(_GRID, _GRID), np.int32)
 
 
 def _border(points, edges, grid):
@@ -163,55 +155,60 @@ def _candidates(vectors, grid):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find(tables, x, y, z, index, weight):
-    """Weights of direction (x, y, z) over the measured ones.
+def find(tables, directions, index, weight):
+    """Weights of many directions over the measured ones.
+
+    The tables are unpacked once for all queries: passing them to a call for each one costs as much as finding it.
 
     Parameters
     ----------
     tables : HemisphereTables
-    x, y, z : float
-        Unit vector; below the surface it is taken at the horizon.
-    index, weight : (4,) int32, (4,) float64
-        Filled in place.
-
-    Returns
-    -------
-    int
-        How many entries are used: 1, 3 or 4.
+    directions : (m, 3) float32 or float64
+        Unit vectors; those below the surface are taken at the horizon.
+    index, weight : (m, 4) int32, (m, 4) float64
+        Filled in place; entries of weight 0 name some direction.
     """
-    if z < 0.0:
-        length = np.sqrt(x * x + y * y) + 1e-30
-        x /= length
-        y /= length
-        z = 0.0
-    scale = 1.0 / (1.0 + z)
-    px = x * scale
-    py = y * scale
-    i = min(max(int((px + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
-    j = min(max(int((py + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
-    if tables.mode > 0:
-        return _nearest(
-            tables.vectors,
-            tables.first,
-            tables.near,
-            i * _GRID + j,
-            x,
-            y,
-            z,
-            tables.mode,
-            index,
-            weight,
-        )
-    triangles = tables.triangles
-    inverse = tables.inverse
-    if triangles.shape[0] > 0:
-        triangle = tables.start[i, j]
-        for _ in range(triangles.shape[0]):
+    vectors, triangles, neighbours = tables.vectors, tables.triangles, tables.neighbours
+    inverse, start, mode = tables.inverse, tables.start, tables.mode
+    edges, ends, border_first, border = (
+        tables.edges, tables.ends, tables.border_first, tables.border,
+    )  # fmt: skip
+    first, near = tables.first, tables.near
+    steps = triangles.shape[0]
+    for q in range(len(directions)):
+        x = float(directions[q, 0])
+        y = float(directions[q, 1])
+        z = float(directions[q, 2])
+        if z < 0.0:
+            length = np.sqrt(x * x + y * y) + 1e-30
+            x /= length
+            y /= length
+            z = 0.0
+        scale = 1.0 / (1.0 + z)
+        px = x * scale
+        py = y * scale
+        i = min(max(int((px + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
+        j = min(max(int((py + 1.0) * (0.5 * _GRID)), 0), _GRID - 1)
+        cell = i * _GRID + j
+        if mode > 0:
+            _nearest(vectors, first, near, cell, x, y, z, mode, index, weight, q)
+            continue
+        triangle = start[cell] if steps > 0 else -1
+        while triangle >= 0:
             qx = px - inverse[triangle, 0]
             qy = py - inverse[triangle, 1]
             wb = inverse[triangle, 2] * qx + inverse[triangle, 3] * qy
             wc = inverse[triangle, 4] * qx + inverse[triangle, 5] * qy
             wa = 1.0 - wb - wc
+            if wa >= -_EPSILON and wb >= -_EPSILON and wc >= -_EPSILON:
+                index[q, 0] = triangles[triangle, 0]
+                index[q, 1] = triangles[triangle, 1]
+                index[q, 2] = triangles[triangle, 2]
+                weight[q, 0] = wa
+                weight[q, 1] = wb
+                weight[q, 2] = wc
+                break
+            # on across the edge that is farthest behind; a Delaunay triangulation has no loops for this walk
             least = 0
             low = wa
             if wb < low:
@@ -219,44 +216,37 @@ def find(tables, x, y, z, index, weight):
                 low = wb
             if wc < low:
                 least = 2
-                low = wc
-            if low >= -_EPSILON:
-                index[0] = triangles[triangle, 0]
-                index[1] = triangles[triangle, 1]
-                index[2] = triangles[triangle, 2]
-                weight[0] = wa
-                weight[1] = wb
-                weight[2] = wc
-                return 3
-            following = tables.neighbours[triangle, least]
-            if following < 0:
-                break
-            triangle = following
-    best = np.inf
-    index[2] = 0
-    weight[2] = 0.0
-    edges = tables.edges
-    cell = i * _GRID + j
-    for at in range(tables.border_first[cell], tables.border_first[cell + 1]):
-        e = tables.border[at]
-        qx = px - edges[e, 0]
-        qy = py - edges[e, 1]
-        along = min(max(qx * edges[e, 4] + qy * edges[e, 5], 0.0), 1.0)
-        qx -= along * edges[e, 2]
-        qy -= along * edges[e, 3]
-        distance = qx * qx + qy * qy
-        if distance < best:
-            best = distance
-            index[0] = tables.ends[e, 0]
-            index[1] = tables.ends[e, 1]
-            weight[0] = 1.0 - along
-            weight[1] = along
-    return 3
+            triangle = neighbours[triangle, least]
+        if triangle < 0:
+            best = np.inf
+            for at in range(border_first[cell], border_first[cell + 1]):
+                e = border[at]
+                qx = px - edges[e, 0]
+                qy = py - edges[e, 1]
+                along = min(max(qx * edges[e, 4] + qy * edges[e, 5], 0.0), 1.0)
+                qx -= along * edges[e, 2]
+                qy -= along * edges[e, 3]
+                distance = qx * qx + qy * qy
+                if distance < best:
+                    best = distance
+                    index[q, 0] = ends[e, 0]
+                    index[q, 1] = ends[e, 1]
+                    weight[q, 0] = 1.0 - along
+                    weight[q, 1] = along
+            index[q, 2] = 0
+            weight[q, 2] = 0.0
+        index[q, 3] = 0
+        weight[q, 3] = 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _nearest(vectors, first, near, cell, x, y, z, count, index, weight):
+def _nearest(vectors, first, near, cell, x, y, z, count, indices, weights, q):
     """The nearest directions; weights fall to zero at the distance of the next one (Shepard, Franke-Little)."""
+    index = indices[q]
+    weight = weights[q]
+    for k in range(4):
+        index[k] = 0
+        weight[k] = 0.0
     n = vectors.shape[0]
     used = min(count, n)
     for k in range(used):
@@ -281,14 +271,14 @@ def _nearest(vectors, first, near, cell, x, y, z, count, index, weight):
             beyond = chord
     if used == 1:
         weight[0] = 1.0
-        return 1
+        return
     radius = np.sqrt(beyond) if n > used else 2.0
     total = 0.0
     if weight[0] < 1e-18:
         weight[0] = 1.0
         for k in range(1, used):
             weight[k] = 0.0
-        return used
+        return
     for k in range(used):
         w = (1.0 / np.sqrt(weight[k]) - 1.0 / radius) ** 2
         weight[k] = w
@@ -296,13 +286,6 @@ def _nearest(vectors, first, near, cell, x, y, z, count, index, weight):
     if total <= 0.0:
         for k in range(used):
             weight[k] = 1.0 / used
-        return used
+        return
     for k in range(used):
         weight[k] /= total
-    return used
-
-
-@njit(cache=True, nogil=True)
-def _find_all(tables, queries, index, weight):
-    for q in range(queries.shape[0]):
-        find(tables, queries[q, 0], queries[q, 1], queries[q, 2], index[q], weight[q])

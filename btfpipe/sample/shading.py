@@ -139,61 +139,41 @@ class PairWeights:
         self.most = {"barycentric": 9, "four": 16, "nearest": 1}[interpolation]
 
     def blocks(self, w_i, w_o):
-        """Yield (slice, pair, share) over the queries; arrays as `find_pairs` fills them.
+        """Yield (slice, pair, share) over blocks of queries (m, 3) float32, unit vectors in the sample's frame.
 
-        Blocks keep the lists in the processor's cache between the two kernels. Two kernels, since one that
-        finds and blends in the same loop spends a third of its time counting references to the tables.
+        `pair` (n, 1, 9 or 16) int32 and `share` of the same shape, float32, are used again for the next block; blocks
+        keep them in the processor's cache. Between lights value / cos(theta_i) is interpolated and multiplied by
+        the true cosine; shares are 0 for a light below the horizon.
         """
+        n = min(len(w_i), _QUERIES)
+        index = np.empty((2, n, 4), np.int32)
+        weight = np.empty((2, n, 4))
+        pair = np.empty((n, self.most), np.int32)
+        share = np.empty((n, self.most), np.float32)
         for part in blocks(len(w_i), _QUERIES):
             n = part.stop - part.start
-            pair = np.empty((n, self.most), np.int32)
-            share = np.empty((n, self.most), np.float32)
-            find_pairs(
-                self.lights, self.inverse_cosines, self.views, w_i[part], w_o[part], pair, share
+            find(self.lights, w_i[part], index[0, :n], weight[0, :n])
+            find(self.views, w_o[part], index[1, :n], weight[1, :n])
+            _combine(
+                self.inverse_cosines, w_i[part], index[:, :n], weight[:, :n], pair[:n], share[:n]
             )
-            yield part, pair, share
+            yield part, pair[:n], share[:n]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_pairs(lights, inverse_cosines, views, w_i, w_o, pair, share):
-    """Pairs and weights that stand for each light and view.
-
-    Parameters
-    ----------
-    lights, views : HemisphereTables
-    inverse_cosines : (lights,) float64
-        Between lights, value / cos(theta_i) is interpolated and multiplied by the true cosine.
-    w_i, w_o : (n, 3) float32
-        Unit vectors in the sample's frame.
-    pair : (n, most) int32
-        Filled in place.
-    share : (n, most) float32
-        Filled in place; all 0 for a light below the horizon.
-    """
-    light = np.zeros(4, np.int32)
-    view = np.zeros(4, np.int32)
-    by_light = np.zeros(4)
-    by_view = np.zeros(4)
+def _combine(inverse_cosines, w_i, index, weight, pair, share):
+    """Pairs and shares of the lights and views found; all shares are 0 for a light below the horizon."""
     count = len(inverse_cosines)
+    one = int(np.sqrt(pair.shape[1]))
     for q in range(len(w_i)):
-        cosine = w_i[q, 2]
-        if cosine <= 0.0:
-            pair[q] = 0
-            share[q] = 0.0
-            continue
-        n_lights = find(lights, w_i[q, 0], w_i[q, 1], cosine, light, by_light)
-        n_views = find(views, w_o[q, 0], w_o[q, 1], w_o[q, 2], view, by_view)
-        for i in range(n_lights):
-            by_light[i] *= cosine * inverse_cosines[light[i]]
-        used = 0
-        for o in range(n_views):
-            for i in range(n_lights):
-                pair[q, used] = view[o] * count + light[i]
-                share[q, used] = by_view[o] * by_light[i]
-                used += 1
-        for k in range(used, pair.shape[1]):
-            pair[q, k] = pair[q, 0]
-            share[q, k] = 0.0
+        cosine = max(w_i[q, 2], 0.0)
+        for o in range(one):
+            for i in range(one):
+                light = index[0, q, i]
+                pair[q, o * one + i] = index[1, q, o] * count + light
+                share[q, o * one + i] = (
+                    weight[1, q, o] * weight[0, q, i] * cosine * inverse_cosines[light]
+                )
 
 
 @njit(cache=True, nogil=True)
