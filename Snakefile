@@ -27,7 +27,7 @@ include: "workflow/rules/compare.smk"
 
 
 rule all:
+    default_target: True
     input:
         all_pictures(),
         all_fidelity(),
-    default_target: True

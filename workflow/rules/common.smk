@@ -54,7 +54,10 @@ def sample_options(wildcards):
     return " ".join(
         filter(
             None,
-            [option("--transfer", sample.get("transfer")), option("--crop", sample.get("crop"))],
+            [
+                option("--transfer", sample.get("transfer")),
+                option("--crop", sample.get("crop")),
+            ],
         )
     )
 

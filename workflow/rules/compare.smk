@@ -50,7 +50,9 @@ rule compare_truth:
     resources:
         mem_mb=2000,
     params:
-        code=source_digest("metrics", "directions", "compression", "sample", "cli/compare.py"),
+        code=source_digest(
+            "metrics", "directions", "compression", "sample", "cli/compare.py"
+        ),
     message:
         "comparing the {wildcards.what} of {wildcards.sample} with the truth between its directions"
     shell:

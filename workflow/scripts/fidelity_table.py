@@ -9,7 +9,7 @@ HEAD = ["material", "what", "against", "between directions", "PSNR dB", "relativ
 
 def rows_of(report, material, what, against):
     """One row an interpolation of a report."""
-    for name, result in report["results"].items():
+    for name, result in report["comparisons"].items():
         linear, display = result["linear"], result["display"]
         yield [
             material,
