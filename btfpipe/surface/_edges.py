@@ -311,24 +311,23 @@ def _may_lose(corner, opposite, leave, v):
 
 
 @njit(cache=True, nogil=True)
-def _degree(opposite, leave, v):
-    """Number of edges at v, and 6 or 4, the number an even mesh has there."""
-    h = leave[v]
-    n = 0
-    while n < 1000:
-        n += 1
-        h = opposite[_previous(h)]
-        if h < 0:
-            return n + 1, 4
-        if h == leave[v]:
-            break
-    return n, 6
+def _excess(corner, opposite, n_faces, n_vertices):
+    """How many edges more each vertex has than the 6, or 4 on a boundary, of an even mesh."""
+    excess = np.full(n_vertices, -6, np.int32)
+    for h in range(3 * n_faces):
+        if corner[h - h % 3] >= 0:
+            excess[corner[h]] += 1
+            if opposite[h] < 0:
+                # the boundary's other edge at this vertex has no half-edge that leaves it
+                excess[corner[h]] += 3
+    return excess
 
 
 @njit(cache=True, nogil=True)
 def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
     """Flip edges towards even degrees (`by_degree`) or towards Delaunay triangles; returns the number of flips."""
     done = 0
+    excess = _excess(corner, opposite, n_faces, len(leave))
     for h in range(3 * n_faces):
         g = opposite[h]
         if corner[h - h % 3] < 0 or g < h or feature[h]:
@@ -337,13 +336,12 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         g1, g2 = _next(g), _previous(g)
         a, b, c, d = corner[h], corner[h1], corner[h2], corner[g2]
         if by_degree:
-            na, ia = _degree(opposite, leave, a)
-            nb, ib = _degree(opposite, leave, b)
-            nc, ic = _degree(opposite, leave, c)
-            nd, idd = _degree(opposite, leave, d)
-            before = (na - ia) ** 2 + (nb - ib) ** 2 + (nc - ic) ** 2 + (nd - idd) ** 2
+            before = excess[a] ** 2 + excess[b] ** 2 + excess[c] ** 2 + excess[d] ** 2
             after = (
-                (na - 1 - ia) ** 2 + (nb - 1 - ib) ** 2 + (nc + 1 - ic) ** 2 + (nd + 1 - idd) ** 2
+                (excess[a] - 1) ** 2
+                + (excess[b] - 1) ** 2
+                + (excess[c] + 1) ** 2
+                + (excess[d] + 1) ** 2
             )
             if after >= before:
                 continue
@@ -381,6 +379,10 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         _settle(opposite, leave, b, j + 1)
         _settle(opposite, leave, c, i + 2)
         _settle(opposite, leave, d, j)
+        excess[a] -= 1
+        excess[b] -= 1
+        excess[c] += 1
+        excess[d] += 1
         done += 1
     return done
 

@@ -11,6 +11,7 @@ from btfpipe.surface import _edges
 from btfpipe.surface.topology import edge_keys, half_edges, opposite_half_edges
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
+_MORE_ROUNDS = 6
 
 
 class _Mesh:
@@ -97,7 +98,7 @@ def _keys(pairs, faces):
     return pairs.min(axis=1) * base + pairs.max(axis=1)
 
 
-def resample(source, n_vertices, report=lambda done, total: None, polish=8, settle=7):
+def resample(source, n_vertices, report=lambda done, total: None, polish=5, settle=6):
     """Resample a smooth input to about `n_vertices` evenly spaced vertices.
 
     Parameters
@@ -137,11 +138,14 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=8, sett
     for i in range(halvings):
         _round(mesh, source, target * 2.0 ** (halvings - i))
         report(i, rounds)
-    for i in range(polish):
+    for i in range(polish + _MORE_ROUNDS):
         _round(mesh, source, target)
-        # few vertices more or less make edges a little shorter or longer: aim at the wanted number
-        target *= np.clip(np.sqrt(mesh.n_vertices / n_vertices), 0.8, 1.25)
-        report(halvings + i, rounds)
+        off = mesh.n_vertices / n_vertices
+        if i + 1 >= polish and abs(off - 1) < 0.02:
+            break
+        # aim at the wanted number; edges between too short and too long stay, so aim beyond
+        target *= np.clip(off, 0.8, 1.25)
+        report(halvings + min(i, polish), rounds)
     for i in range(settle):
         face, weights = mesh.smooth(source, 0.5 * target)
         mesh.flip(i < settle // 2)
