@@ -14,7 +14,7 @@ from btfpipe.hashing import uniform
 from btfpipe.synthesis.coordinate_map import CoordinateMap
 from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar, is_inside
 from btfpipe.synthesis.growth import COHERENCE, SWEEPS, summary
-from btfpipe.synthesis.search import CANDIDATES, FALLBACKS, MOVED, STARTS
+from btfpipe.synthesis.search import CANDIDATES, FALLBACKS, MOVED, STARTS, square_of_run
 
 _FAST = {"reassoc", "contract", "nsz"}
 _ROWS = 16  # rows between two reports of progress
@@ -63,53 +63,53 @@ def grow_over_plane(
         texel = np.empty((rows, cols), np.int32)
         if below is None:
             _scatter(sample, np.uint64(seed), texel)
-            coarse = _Canvas(sample.coarse, np.zeros((0, 0), np.int32), sample)
+            coarse = _canvas(sample.coarse, texel)
         else:
             _inherit(below, coarse_sample, sample, texel)
-            coarse = _Canvas(sample.coarse, below, coarse_sample)
-        canvas = _Canvas(sample.fine, texel, sample)
+            coarse = _canvas(sample.coarse, below)
+        canvas = _canvas(sample.fine, texel)
         half = side // 2
+        where = np.stack([texel // sample.cols, texel % sample.cols], axis=2).astype(np.int32)
+        where = np.pad(where, ((half, half), (half, half), (0, 0)), "wrap")
         distances = np.zeros((rows, cols), np.float32)
-        done = np.full((rows + 2 * half, cols + 2 * half), below is not None)
+        done = np.full(where.shape[:2], below is not None)
         for sweep in range(sweeps[0] if below is None else sweeps[1]):
             tally = np.zeros(5, np.int64)
             start = time.perf_counter()
             for first in range(0, rows, _ROWS):
                 last = min(first + _ROWS, rows)
                 grow_rows(
-                    first, last, texel, canvas.labels, canvas.image, coarse.labels, coarse.image, done, distances,
-                    sample, full, np.float32(0.0 if below is None else coherence), tally,
+                    first, last, where, canvas, coarse, done, distances, sample, full,
+                    np.float32(0.0 if below is None else coherence), tally,
                 )  # fmt: skip
                 finished += (last - first) * cols
                 if on_progress is not None:
                     on_progress(finished, total)
             seconds = time.perf_counter() - start
             report.append(summary(i, sweep, tally, distances, seconds, seconds))
-        below, coarse_sample = texel, sample
+        where = where[half:-half, half:-half] if half else where
+        below, coarse_sample = where[..., 0] * sample.cols + where[..., 1], sample
     return CoordinateMap(
-        (texel // sample.cols).reshape(1, -1),
-        (texel % sample.cols).reshape(1, -1),
-        np.zeros((1, texel.size), np.float32),
+        where[..., 0].reshape(1, -1),
+        where[..., 1].reshape(1, -1),
+        np.zeros((1, below.size), np.float32),
         1.0,
         {"plane": [int(n) for n in shape], "toroidal": True},
         about={"synthesis": report},
     )
 
 
-class _Canvas:
-    """What an output level looks like, with a border that continues it: labels, and features if these are compared."""
-
-    def __init__(self, tables, texel, sample):
-        half = tables.side // 2
-        self.labels = np.zeros((0, 0), np.int32)
-        self.image = np.zeros((0, 0, 0), np.float32)
-        if not tables.side:
-            return
-        own = tables.labels.shape[0] - 2 * half, tables.labels.shape[1] - 2 * half
-        inner = tables.labels[half : half + own[0], half : half + own[1]]
-        self.labels = np.pad(inner.ravel()[texel], half, "wrap")
-        if len(tables.vectors):
-            self.image = tables.vectors[self.labels]
+def _canvas(tables, texel):
+    """What an output level looks like, flat, with a border that continues it: labels, features, width in texels."""
+    half = tables.side // 2
+    if not tables.side:
+        return np.zeros(0, np.int32), np.zeros(0, np.float32), 0
+    inner = tables.labels[
+        half : tables.labels.shape[0] - half, half : tables.labels.shape[1] - half
+    ]
+    labels = np.pad(inner.ravel()[texel], half, "wrap")
+    image = tables.vectors[labels] if len(tables.vectors) else np.zeros(0, np.float32)
+    return np.ascontiguousarray(labels).ravel(), image.ravel(), labels.shape[1]
 
 
 @njit(cache=True, nogil=True)
@@ -136,32 +136,34 @@ def _inherit(below, coarse_sample, sample, texel):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _square(labels, image, r, c, tables, s, e, total, limit):
+def _square(
+    ours,
+    our_image,
+    our_width,
+    r,
+    c,
+    side,
+    labels,
+    table,
+    image,
+    width,
+    n,
+    depth,
+    s,
+    e,
+    total,
+    limit,
+):
     """`total` plus the distance of the squares at (r, c) of the output and (s, e) of the sample, up to `limit`."""
-    side = tables.side
-    if tables.table.shape[0] > 0:
-        n = tables.table.shape[1]
-        table = tables.table.ravel()
-        ours, theirs = labels.ravel(), tables.labels.ravel()
-        width, other_width = labels.shape[1], tables.labels.shape[1]
-        for i in range(side):
-            run = (r + i) * width + c
-            other = (s + i) * other_width + e
-            for j in range(side):
-                total += table[ours[run + j] * n + theirs[other + j]]
-            if total >= limit:
-                return total
-        return total
-    depth = image.shape[2]
-    ours, theirs = image.ravel(), tables.image.ravel()
-    width, other_width = image.shape[1] * depth, tables.image.shape[1] * depth
     for i in range(side):
-        run = (r + i) * width + c * depth
-        other = (s + i) * other_width + e * depth
+        run = (r + i) * our_width + c
+        other = (s + i) * width + e
         part = np.float32(0.0)
-        for d in range(side * depth):
-            step = ours[run + d] - theirs[other + d]
-            part += step * step
+        if n > 0:
+            for j in range(side):
+                part += table[ours[run + j] * n + labels[other + j]]
+        else:
+            part = square_of_run(our_image, run * depth, image, other * depth, side * depth)
         total += part
         if total >= limit:
             return total
@@ -169,18 +171,18 @@ def _square(labels, image, r, c, tables, s, e, total, limit):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _places(labels, image, r, c, tables, s, e, places, count, limit):
+def _places(
+    ours, our_image, our_width, r, c, labels, table, image, width, n, depth, s, e, places, limit
+):
     """As `_square`, over some places of the square only: those synthesised."""
     total = np.float32(0.0)
-    side = tables.side
-    for p in range(count):
-        i, j = places[p] // side, places[p] % side
-        if tables.table.shape[0] > 0:
-            total += tables.table[labels[r + i, c + j], tables.labels[s + i, e + j]]
+    for p in range(places.shape[0]):
+        run = (r + places[p, 0]) * our_width + c + places[p, 1]
+        other = (s + places[p, 0]) * width + e + places[p, 1]
+        if n > 0:
+            total += table[ours[run] * n + labels[other]]
         else:
-            for d in range(image.shape[2]):
-                step = image[r + i, c + j, d] - tables.image[s + i, e + j, d]
-                total += step * step
+            total += square_of_run(our_image, run * depth, image, other * depth, depth)
         if total >= limit:
             return total
     return total
@@ -188,38 +190,48 @@ def _places(labels, image, r, c, tables, s, e, places, count, limit):
 
 @njit(cache=True, nogil=True)
 def _compare(
-    texel, sample, labels, image, r, c, coarse_labels, coarse_image, places, count, limit
-):  # fmt: skip
+    texel,
+    r,
+    c,
+    cols,
+    side,
+    canvas,
+    flat,
+    coarse_side,
+    coarse_canvas,
+    coarse_flat,
+    places,
+    whole,
+    limit,
+):
     """Distance of the output's neighbourhoods at (r, c) to those of a texel of the sample."""
-    s = texel // sample.cols
-    e = texel - s * sample.cols
+    s = texel // cols
+    e = texel - s * cols
     total = np.float32(0.0)
-    if sample.coarse.side > 0:
+    if coarse_side > 0:
         total = _square(
-            coarse_labels, coarse_image, r >> 1, c >> 1, sample.coarse, coarse_texel(s), coarse_texel(e),
-            total, limit,
+            *coarse_canvas, r >> 1, c >> 1, coarse_side, *coarse_flat, coarse_texel(s), coarse_texel(e), total,
+            limit,
         )  # fmt: skip
         if total >= limit:
             return total
-    if count < sample.fine.side * sample.fine.side:
-        return _places(labels, image, r, c, sample.fine, s, e, places, count, limit)
-    return _square(labels, image, r, c, sample.fine, s, e, total, limit)
+    if whole:
+        return _square(*canvas, r, c, side, *flat, s, e, total, limit)
+    return _places(*canvas, r, c, *flat, s, e, places, limit)
 
 
 @njit(cache=True, nogil=True)
 def grow_rows(
-    first, last, texel, labels, image, coarse_labels, coarse_image, done, distances, sample, full, kappa, tally
+    first, last, where, canvas, coarse_canvas, done, distances, sample, full, kappa, tally
 ):  # fmt: skip
     """Synthesise rows first to last in scanning order; the search is that of `search.grow`.
 
     Parameters
     ----------
-    texel : (rows, cols) int32
-        Texels of the sample; changed in place.
-    labels, image : (rows + side - 1, cols + side - 1[, d])
-        What they look like, with a border; kept up to date.
-    coarse_labels, coarse_image
-        The same of the coarser level.
+    where : (rows + side - 1, cols + side - 1, 2) int32
+        Row and col in the sample of each texel of the output, with a border that continues it; changed in place.
+    canvas, coarse_canvas : (labels, image, width)
+        What the output looks like on this level and the coarser one, flat, with the same border; this level's is kept up to date.
     done : (rows + side - 1, cols + side - 1) bool
         What has been synthesised; only this counts.
     distances : (rows, cols) float32
@@ -229,16 +241,24 @@ def grow_rows(
     kappa : float32
     tally : (5,) int64
     """
-    rows, cols = texel.shape
     side = sample.fine.side
     half = side // 2
-    depth = image.shape[2]
+    rows, cols = distances.shape
+    width = cols + 2 * half
+    our_labels, our_image, _ = canvas
+    labels, _, image, sample_width, _, depth = sample.fine.flat
+    sample_rows, sample_cols = sample.rows, sample.cols
+    lists = sample.lists
+    toroidal = sample.toroidal
     low, high, left, right = sample.inside
-    compared = np.full(sample.rows * sample.cols, -1, np.int32)
-    places = np.empty(side * side, np.int64)
+    compared = np.full(sample_rows * sample_cols, -1, np.int32)
+    slot = np.empty(sample_rows * sample_cols, np.int32)
+    places = np.empty((side * side, 2), np.int32)
     owners = np.empty(side * side, np.int32)
     support = np.empty(side * side, np.float32)
-    slot = np.empty(sample.rows * sample.cols, np.int32)
+    pair = (
+        sample_cols, side, canvas, sample.fine.flat, sample.coarse.side, coarse_canvas, sample.coarse.flat,
+    )  # fmt: skip
     for r in range(first, last):
         for c in range(cols):
             stamp = r * cols + c
@@ -248,17 +268,17 @@ def grow_rows(
                 for j in range(side):
                     if not done[r + i, c + j]:
                         continue
-                    places[count] = i * side + j
+                    places[count, 0] = i
+                    places[count, 1] = j
                     count += 1
-                    u = texel[(r + i - half) % rows, (c + j - half) % cols]
-                    s = u // sample.cols + half - i
-                    e = u % sample.cols + half - j
-                    if sample.toroidal:
-                        s %= sample.rows
-                        e %= sample.cols
-                    elif s < 0 or s >= sample.rows or e < 0 or e >= sample.cols:
+                    s = where[r + i, c + j, 0] + half - i
+                    e = where[r + i, c + j, 1] + half - j
+                    if toroidal:  # a sample has at least `side` texels: one period is enough
+                        s += sample_rows if s < 0 else (-sample_rows if s >= sample_rows else 0)
+                        e += sample_cols if e < 0 else (-sample_cols if e >= sample_cols else 0)
+                    elif s < 0 or s >= sample_rows or e < 0 or e >= sample_cols:
                         continue
-                    t = s * sample.cols + e
+                    t = s * sample_cols + e
                     if compared[t] == stamp:
                         support[slot[t]] += np.float32(1.0)
                     else:
@@ -267,10 +287,13 @@ def grow_rows(
                         owners[n] = t
                         support[n] = np.float32(1.0)
                         n += 1
-            best = texel[r, c]
+            old = where[r + half, c + half, 0] * sample_cols + where[r + half, c + half, 1]
+            best = old
             if count == 0:
                 tally[STARTS] += 1
             else:
+                whole = count == side * side
+                around = places[:count]
                 best = -1
                 best_distance = np.float32(np.inf)
                 lowest = np.float32(np.inf)
@@ -279,10 +302,7 @@ def grow_rows(
                     if is_inside(owners[j], sample):
                         found += 1
                         penalty = np.float32(1.0) + kappa * (np.float32(1.0) - support[j] / count)
-                        distance = _compare(
-                            owners[j], sample, labels, image, r, c, coarse_labels, coarse_image, places,
-                            count, lowest / penalty,
-                        )  # fmt: skip
+                        distance = _compare(owners[j], r, c, *pair, around, whole, lowest / penalty)
                         if distance * penalty < lowest:
                             lowest = distance * penalty
                             best_distance = distance
@@ -290,16 +310,13 @@ def grow_rows(
                 limit = lowest / (np.float32(1.0) + kappa)
                 if not full:
                     for j in range(n):
-                        for m in range(1, sample.lists.shape[1]):
-                            t = sample.lists[owners[j], m]
+                        for m in range(1, lists.shape[1]):
+                            t = lists[owners[j], m]
                             if compared[t] == stamp:
                                 continue
                             compared[t] = stamp
                             found += 1
-                            distance = _compare(
-                                t, sample, labels, image, r, c, coarse_labels, coarse_image, places, count,
-                                limit,
-                            )  # fmt: skip
+                            distance = _compare(t, r, c, *pair, around, whole, limit)
                             if distance < limit:
                                 limit = distance
                                 best_distance = distance
@@ -309,29 +326,29 @@ def grow_rows(
                 if full or best < 0:
                     for s in range(low, high):
                         for e in range(left, right):
-                            t = s * sample.cols + e
+                            t = s * sample_cols + e
                             if compared[t] == stamp:
                                 continue
                             found += 1
-                            distance = _compare(
-                                t, sample, labels, image, r, c, coarse_labels, coarse_image, places, count,
-                                limit,
-                            )  # fmt: skip
+                            distance = _compare(t, r, c, *pair, around, whole, limit)
                             if distance < limit:
                                 limit = distance
                                 best_distance = distance
                                 best = t
                 tally[CANDIDATES] += found
                 distances[r, c] = best_distance
-            if best != texel[r, c]:
+            if best != old:
                 tally[MOVED] += 1
-            texel[r, c] = best
-            s = best // sample.cols + half
-            e = best % sample.cols + half
+            s = best // sample_cols
+            e = best - s * sample_cols
+            texel = (s + half) * sample_width + e + half
             # The texel, and its copies in the border.
             for i in range((r + half) % rows, rows + 2 * half, rows):
                 for j in range((c + half) % cols, cols + 2 * half, cols):
                     done[i, j] = True
-                    labels[i, j] = sample.fine.labels[s, e]
+                    where[i, j, 0] = s
+                    where[i, j, 1] = e
+                    place = i * width + j
+                    our_labels[place] = labels[texel]
                     for d in range(depth):
-                        image[i, j, d] = sample.fine.image[s, e, d]
+                        our_image[place * depth + d] = image[texel * depth + d]

@@ -60,12 +60,25 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
             base[p, 2] = c * n
         else:
             constant[p] = 0.0
-            for i in range(blend.shape[1]):
-                blend[p, i] = (
+            depth = tables.vectors.shape[1]
+            for i in range(depth):
+                blend[p * depth + i] = (
                     wa * tables.vectors[a, i]
                     + wb * tables.vectors[b, i]
                     + wc * tables.vectors[c, i]
                 )
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def square_of_run(a, i, b, j, n):
+    """Squared distance of ``a[i:i + n]`` and ``b[j:j + n]``. Unsigned places: signed ones may be negative, and are not vectorised."""
+    i = np.uint64(i)
+    j = np.uint64(j)
+    total = np.float32(0.0)
+    for d in range(np.uint64(n)):
+        step = a[i + d] - b[j + d]
+        total += step * step
+    return total
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -87,15 +100,18 @@ def _square(
                 )
                 p += 1
         else:
+            solid = True
             for j in range(side):
-                if constant[p] >= 0:
-                    start = (run + j) * depth
-                    part = np.float32(0.0)
-                    for d in range(depth):
-                        step = blend[p, d] - image[start + d]
-                        part += step * step
-                    total += part
-                p += 1
+                solid &= constant[p + j] >= 0
+            if solid:
+                total += square_of_run(blend, p * depth, image, run * depth, side * depth)
+            else:
+                for j in range(side):
+                    if constant[p + j] >= 0:
+                        total += square_of_run(
+                            blend, (p + j) * depth, image, (run + j) * depth, depth
+                        )
+            p += side
         if total >= limit:
             return total
     return total
@@ -126,7 +142,7 @@ def _room(tables):
         np.zeros((pixels, 3), np.int32),
         np.zeros((pixels, 3), np.float32),
         np.zeros(pixels, np.float32),
-        np.zeros((pixels, tables.vectors.shape[1]), np.float32),
+        np.zeros(pixels * tables.vectors.shape[1], np.float32),
     )
 
 
