@@ -59,6 +59,7 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
         mesh=lambda name: read_parts(spec.parent / name),
     )
     patch = materials.build_patch(wanted, files)
+    memory -= campaign.require_memory(patch, wanted["inter_reflection"]["rays"], memory)
     goniometer = Goniometer(
         patch, wanted["samples"], **wanted["inter_reflection"], seed=seed, threads=threads
     )

@@ -9,12 +9,12 @@ from btfpipe.errors import InputError
 # Which triangle of the tile was met (-1: none), its barycentric coordinates, and whether from outside.
 Hits = namedtuple("Hits", "face u v front")
 
-_STEEPEST_DEG = 80  # directions up to here need no second trace, unless the structure is very deep
+_STEEPEST_DEG = 76  # directions up to here need no second trace, unless the structure is very deep
 _MAX_COPIES = 3
 
 
 class Tracer:
-    """Embree over enough copies of one tile; results are those of the infinite tiling.
+    """Embree over one tile and enough of its neighbours; results are those of the infinite tiling.
 
     A ray that leaves the copies before it leaves the slab of the structure is put back into the central tile and
     traced on, so even grazing rays are exact.
@@ -40,19 +40,11 @@ class Tracer:
             raise InputError(
                 f"the meso-structure sticks out {out.max()} periods beyond its tile; expected 2 at most."
             )
-        run = depth * np.tan(np.radians(_STEEPEST_DEG)) / self.period
-        reach = np.clip(np.ceil(run), 1, _MAX_COPIES).astype(int)
-        self.margin = (
-            reach.astype(np.float32) * self.period
-        )  # a ray from the central tile may run so far
-        span_s, span_t = (range(-n, n + 1) for n in reach + out)
-        shifts = np.array([(s * cols, t * rows, 0) for t in span_t for s in span_s], np.float32)
-        self.n_faces = len(patch.faces)
-        vertices = (patch.vertices[None] + shifts[:, None]).reshape(-1, 3)
-        offsets = np.arange(len(shifts), dtype=np.int32) * len(patch.vertices)
-        faces = (patch.faces[None] + offsets[:, None, None]).reshape(-1, 3)
+        run = np.minimum(depth * np.tan(np.radians(_STEEPEST_DEG)), _MAX_COPIES * self.period)
+        self.margin = np.maximum(run, 1).astype(np.float32)  # a ray from the tile may run so far
+        vertices, faces, self._face = _surroundings(patch, self.margin, out)
         self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, vertices, np.ascontiguousarray(faces, np.int32))
+        self._mesh = TriangleMesh(self._scene, vertices, faces)
         # the first query builds the tree; two threads must not do that at once
         self._scene.run(np.array([[0, 0, self.top + 1]], np.float32),
                         np.array([[0, 0, 1]], np.float32), query="OCCLUDED")  # fmt: skip
@@ -71,7 +63,7 @@ class Tracer:
             found = self._scene.run(o, d, output=1)
             hit = (found["primID"] >= 0) & (found["tfar"] <= limit)
             at = rays[hit]
-            face[at] = found["primID"][hit] % self.n_faces
+            face[at] = self._face[found["primID"][hit]]
             u[at], v[at] = found["u"][hit], found["v"][hit]
             front[at] = (
                 np.einsum(
@@ -113,9 +105,43 @@ class Tracer:
                 directions, limit = directions[on], limit[on]
             origins = self.wrap(origins[on] + directions * limit[:, None])
             rays = rays[on]
-            # a ray along the plane never leaves the slab: give it up below the horizon's last half degree
-            if len(directions) == 1 and abs(directions[0, 2]) < 1e-2:
+            # a ray along the plane never leaves the slab: give it up within a twentieth of a degree of it
+            if len(directions) == 1 and abs(directions[0, 2]) < 1e-3:
                 return
-            keep = np.abs(directions[:, 2]) >= 1e-2
+            keep = np.abs(directions[:, 2]) >= 1e-3
             if len(directions) > 1 and not keep.all():
                 rays, origins, directions = rays[keep], origins[keep], directions[keep]
+
+
+def _surroundings(patch, margin, out):
+    """The triangles within `margin` of the tile.
+
+    Returns
+    -------
+    vertices : (n, 3) float32
+    faces : (m, 3) int32
+    face : (m,) int32
+        The patch's triangle that each is a copy of.
+    """
+    rows, cols = patch.shape
+    period = np.array([cols, rows])
+    corners = patch.vertices[patch.faces][..., :2]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    span_s, span_t = (range(-n, n + 1) for n in np.ceil(margin / period).astype(int) + out)
+    vertices, faces, face, start = [], [], [], 0
+    for shift in [(s * cols, t * rows) for t in span_t for s in span_s]:
+        near = ((high + shift >= -margin) & (low + shift <= period + margin)).all(axis=1)
+        kept = np.flatnonzero(near).astype(np.int32)
+        used, index = np.unique(patch.faces[kept], return_inverse=True)
+        vertices.append(patch.vertices[used] + np.array([*shift, 0], np.float32))
+        faces.append((index.reshape(-1, 3) + start).astype(np.int32))
+        face.append(kept)
+        start += len(used)
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(face)
+
+
+def copies(patch):
+    """About how many copies of the tile's triangles a Tracer holds."""
+    depth = float(np.ptp(patch.vertices[:, 2]))
+    run = np.minimum(depth * np.tan(np.radians(_STEEPEST_DEG)), _MAX_COPIES * max(patch.shape))
+    return float(np.prod(1 + 2 * run / np.array(patch.shape)))
