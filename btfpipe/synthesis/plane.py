@@ -12,9 +12,16 @@ from numba import njit
 from btfpipe.errors import InputError
 from btfpipe.hashing import uniform
 from btfpipe.synthesis.coordinate_map import CoordinateMap
-from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar, is_inside
+from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar
 from btfpipe.synthesis.growth import COHERENCE, SWEEPS, summary
-from btfpipe.synthesis.search import CANDIDATES, FALLBACKS, MOVED, STARTS, square_of_run
+from btfpipe.synthesis.search import (
+    CANDIDATES,
+    FALLBACKS,
+    MOVED,
+    STARTS,
+    list_candidates,
+    square_of_run,
+)
 
 _FAST = {"reassoc", "contract", "nsz"}
 _ROWS = 16  # rows between two reports of progress
@@ -135,89 +142,83 @@ def _inherit(below, coarse_sample, sample, texel):
             texel[r, c] = row * sample.cols + col
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
 def _square(
-    ours,
-    our_image,
-    our_width,
-    r,
-    c,
-    side,
-    labels,
-    table,
-    image,
-    width,
-    n,
-    depth,
-    s,
-    e,
-    total,
-    limit,
-):
+    ours, our_image, our_width, r, c, side, labels, table, image, width, n, depth, s, e, total, limit
+):  # fmt: skip
     """`total` plus the distance of the squares at (r, c) of the output and (s, e) of the sample, up to `limit`."""
     for i in range(side):
         run = (r + i) * our_width + c
         other = (s + i) * width + e
-        part = np.float32(0.0)
         if n > 0:
             for j in range(side):
-                part += table[ours[run + j] * n + labels[other + j]]
+                total += table[
+                    np.uint64(ours[np.uint64(run + j)] * n + labels[np.uint64(other + j)])
+                ]
         else:
-            part = square_of_run(our_image, run * depth, image, other * depth, side * depth)
-        total += part
+            total += square_of_run(our_image, run * depth, image, other * depth, side * depth)
         if total >= limit:
-            return total
+            break
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
 def _places(
     ours, our_image, our_width, r, c, labels, table, image, width, n, depth, s, e, places, limit
-):
+):  # fmt: skip
     """As `_square`, over some places of the square only: those synthesised."""
     total = np.float32(0.0)
     for p in range(places.shape[0]):
         run = (r + places[p, 0]) * our_width + c + places[p, 1]
         other = (s + places[p, 0]) * width + e + places[p, 1]
         if n > 0:
-            total += table[ours[run] * n + labels[other]]
+            total += table[np.uint64(ours[np.uint64(run)] * n + labels[np.uint64(other)])]
         else:
             total += square_of_run(our_image, run * depth, image, other * depth, depth)
         if total >= limit:
-            return total
+            break
     return total
 
 
-@njit(cache=True, nogil=True)
-def _compare(
-    texel,
-    r,
-    c,
-    cols,
-    side,
-    canvas,
-    flat,
-    coarse_side,
-    coarse_canvas,
-    coarse_flat,
-    places,
-    whole,
-    limit,
-):
-    """Distance of the output's neighbourhoods at (r, c) to those of a texel of the sample."""
-    s = texel // cols
-    e = texel - s * cols
-    total = np.float32(0.0)
-    if coarse_side > 0:
-        total = _square(
-            *coarse_canvas, r >> 1, c >> 1, coarse_side, *coarse_flat, coarse_texel(s), coarse_texel(e), total,
-            limit,
-        )  # fmt: skip
-        if total >= limit:
-            return total
-    if whole:
-        return _square(*canvas, r, c, side, *flat, s, e, total, limit)
-    return _places(*canvas, r, c, *flat, s, e, places, limit)
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _choose(
+    tries, penalty, count, r, c, places, cols, side, canvas, flat, coarse_side, coarse_canvas, coarse_flat
+):  # fmt: skip
+    """Place in `tries` of the texel nearest by penalty times distance, and its distance; the coarser level first."""
+    ours, our_image, our_width = canvas
+    labels, table, image, width, n, depth = flat
+    ours1, our_image1, our_width1 = coarse_canvas
+    labels1, table1, image1, width1, n1, depth1 = coarse_flat
+    whole = places.shape[0] == side * side
+    best = 0
+    best_distance = np.float32(np.inf)
+    lowest = np.float32(np.inf)
+    for m in range(count):
+        limit = lowest / penalty[m]
+        s = tries[m] // cols
+        e = tries[m] - s * cols
+        total = np.float32(0.0)
+        if coarse_side > 0:
+            total = _square(
+                ours1, our_image1, our_width1, r >> 1, c >> 1, coarse_side, labels1, table1, image1, width1,
+                n1, depth1, coarse_texel(s), coarse_texel(e), total, limit,
+            )  # fmt: skip
+        if total < limit:
+            if whole:
+                total = _square(
+                    ours, our_image, our_width, r, c, side, labels, table, image, width, n, depth, s, e,
+                    total, limit,
+                )  # fmt: skip
+            else:
+                total = _places(
+                    ours, our_image, our_width, r, c, labels, table, image, width, n, depth, s, e, places,
+                    limit,
+                )  # fmt: skip
+            if total < limit:
+                best = m
+                best_distance = total
+                lowest = total * penalty[m]
+    return best, best_distance
 
 
 @njit(cache=True, nogil=True)
@@ -248,14 +249,16 @@ def grow_rows(
     our_labels, our_image, _ = canvas
     labels, _, image, sample_width, _, depth = sample.fine.flat
     sample_rows, sample_cols = sample.rows, sample.cols
-    lists = sample.lists
     toroidal = sample.toroidal
-    low, high, left, right = sample.inside
     compared = np.full(sample_rows * sample_cols, -1, np.int32)
     slot = np.empty(sample_rows * sample_cols, np.int32)
     places = np.empty((side * side, 2), np.int32)
     owners = np.empty(side * side, np.int32)
     support = np.empty(side * side, np.float32)
+    most = max(compared.shape[0], side * side * sample.lists.shape[1])
+    tries = np.empty(most, np.int32)
+    origin = np.empty(most, np.int32)
+    penalty = np.empty(most, np.float32)
     pair = (
         sample_cols, side, canvas, sample.fine.flat, sample.coarse.side, coarse_canvas, sample.coarse.flat,
     )  # fmt: skip
@@ -292,51 +295,16 @@ def grow_rows(
             if count == 0:
                 tally[STARTS] += 1
             else:
-                whole = count == side * side
-                around = places[:count]
-                best = -1
-                best_distance = np.float32(np.inf)
-                lowest = np.float32(np.inf)
-                found = 0
                 for j in range(n):
-                    if is_inside(owners[j], sample):
-                        found += 1
-                        penalty = np.float32(1.0) + kappa * (np.float32(1.0) - support[j] / count)
-                        distance = _compare(owners[j], r, c, *pair, around, whole, lowest / penalty)
-                        if distance * penalty < lowest:
-                            lowest = distance * penalty
-                            best_distance = distance
-                            best = owners[j]
-                limit = lowest / (np.float32(1.0) + kappa)
-                if not full:
-                    for j in range(n):
-                        for m in range(1, lists.shape[1]):
-                            t = lists[owners[j], m]
-                            if compared[t] == stamp:
-                                continue
-                            compared[t] = stamp
-                            found += 1
-                            distance = _compare(t, r, c, *pair, around, whole, limit)
-                            if distance < limit:
-                                limit = distance
-                                best_distance = distance
-                                best = t
-                    if best < 0:
-                        tally[FALLBACKS] += 1
-                if full or best < 0:
-                    for s in range(low, high):
-                        for e in range(left, right):
-                            t = s * sample_cols + e
-                            if compared[t] == stamp:
-                                continue
-                            found += 1
-                            distance = _compare(t, r, c, *pair, around, whole, limit)
-                            if distance < limit:
-                                limit = distance
-                                best_distance = distance
-                                best = t
+                    support[j] /= count
+                found = list_candidates(
+                    owners, n, support, kappa, full, sample, compared, stamp, tries, origin, penalty
+                )
+                if origin[0] < 0 and not full:
+                    tally[FALLBACKS] += 1
+                m, distances[r, c] = _choose(tries, penalty, found, r, c, places[:count], *pair)
+                best = tries[m]
                 tally[CANDIDATES] += found
-                distances[r, c] = best_distance
             if best != old:
                 tally[MOVED] += 1
             s = best // sample_cols

@@ -81,7 +81,7 @@ def square_of_run(a, i, b, j, n):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
 def _square(
     r, c, side, labels, table, image, width, n, depth, base, share, constant, blend, total, limit
 ):  # fmt: skip
@@ -91,11 +91,11 @@ def _square(
         run = (r + i) * width + c
         if n > 0:
             for j in range(side):
-                t = labels[run + j]
+                t = labels[np.uint64(run + j)]
                 total += (
-                    share[p, 0] * table[base[p, 0] + t]
-                    + share[p, 1] * table[base[p, 1] + t]
-                    + share[p, 2] * table[base[p, 2] + t]
+                    share[p, 0] * table[np.uint64(base[p, 0] + t)]
+                    + share[p, 1] * table[np.uint64(base[p, 1] + t)]
+                    + share[p, 2] * table[np.uint64(base[p, 2] + t)]
                     - constant[p]
                 )
                 p += 1
@@ -113,25 +113,93 @@ def _square(
                         )
             p += side
         if total >= limit:
-            return total
+            break
     return total
 
 
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _choose(tries, penalty, count, cols, coarse_side, coarse_sample, coarse, side, sample, fine):
+    """Place in `tries` of the texel nearest by penalty times distance, and its distance; the coarser level first."""
+    labels, table, image, width, n, depth = sample
+    base, share, constant, blend = fine
+    labels1, table1, image1, width1, n1, depth1 = coarse_sample
+    base1, share1, constant1, blend1 = coarse
+    best = 0
+    best_distance = np.float32(np.inf)
+    lowest = np.float32(np.inf)
+    for m in range(count):
+        limit = lowest / penalty[m]
+        r = tries[m] // cols
+        c = tries[m] - r * cols
+        total = np.float32(0.0)
+        if coarse_side > 0:
+            total = _square(
+                coarse_texel(r), coarse_texel(c), coarse_side, labels1, table1, image1, width1, n1, depth1,
+                base1, share1, constant1, blend1, total, limit,
+            )  # fmt: skip
+        if total < limit:
+            total = _square(
+                r, c, side, labels, table, image, width, n, depth, base, share, constant, blend, total,
+                limit,
+            )  # fmt: skip
+            if total < limit:
+                best = m
+                best_distance = total
+                lowest = total * penalty[m]
+    return best, best_distance
+
+
 @njit(cache=True, nogil=True)
-def _two_levels(
-    texel, cols, coarse_side, coarse_sample, coarse, side, sample, fine, limit
+def list_candidates(
+    owners, n, support, kappa, full, exemplar, compared, stamp, tries, origin, penalty
 ):  # fmt: skip
-    """Distance of the vertex's neighbourhoods to those of a texel, the coarser level first."""
-    r = texel // cols
-    c = texel - r * cols
-    total = np.float32(0.0)
-    if coarse_side > 0:
-        total = _square(
-            coarse_texel(r), coarse_texel(c), coarse_side, *coarse_sample, *coarse, total, limit
-        )
-        if total >= limit:
-            return total
-    return _square(r, c, side, *sample, *fine, total, limit)
+    """The texels to compare: first those that runs lead to, then their lists, or all texels.
+
+    Parameters
+    ----------
+    owners, support : (n,) int32, float32
+        Texels that the runs lead to, marked as compared, and the share of the runs that do.
+    kappa, full
+        As in `grow`.
+    compared : (texels,) int32
+        Holds `stamp` for texels already listed.
+    tries, origin, penalty : (at least all that can be listed,) int32, int32, float32
+        Filled in: texel, the owner in whose list it was found (-1 in a full search), factor of its distance.
+
+    Returns
+    -------
+    int
+        Number listed.
+    """
+    count = 0
+    for j in range(n):
+        if is_inside(owners[j], exemplar):
+            tries[count] = owners[j]
+            origin[count] = j
+            penalty[count] = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
+            count += 1
+    lists = exemplar.lists
+    if not full:
+        for j in range(n):
+            for e in range(1, lists.shape[1]):
+                texel = lists[owners[j], e]
+                if compared[texel] != stamp:
+                    compared[texel] = stamp
+                    tries[count] = texel
+                    origin[count] = j
+                    penalty[count] = np.float32(1.0) + kappa
+                    count += 1
+    if full or count == 0:
+        low, high, left, right = exemplar.inside
+        for r in range(low, high):
+            for c in range(left, right):
+                texel = r * exemplar.cols + c
+                if compared[texel] != stamp:
+                    tries[count] = texel
+                    origin[count] = -1
+                    penalty[count] = np.float32(1.0) + kappa
+                    count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -193,7 +261,10 @@ def grow(
     support = np.empty(widest, np.float32)
     fraction = np.empty((widest, 2), np.float32)
     always = np.ones(1, np.bool_)
-    low, high, left, right = exemplar.inside
+    most = max(compared.shape[0], widest * exemplar.lists.shape[1])
+    tries = np.empty(most, np.int32)
+    origin = np.empty(most, np.int32)
+    penalty = np.empty(most, np.float32)
     for i in range(vertices.shape[0]):
         v = vertices[i]
         if not _is_news(patches.pixel_vertex[i], patches.patch_vertex[i], visited[v], moved):
@@ -228,52 +299,14 @@ def grow(
             done[v] = True
             moved[v] = tally[CLOCK]
             continue
-        best = -1
-        best_run = -1
-        best_distance = np.float32(np.inf)  # as measured
-        lowest = np.float32(np.inf)  # with the penalty for incoherence
-        found = 0
-        for j in range(n):
-            if is_inside(owners[j], exemplar):
-                found += 1
-                penalty = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
-                distance = _two_levels(owners[j], *pair, lowest / penalty)
-                if distance * penalty < lowest:
-                    lowest = distance * penalty
-                    best_distance = distance
-                    best = owners[j]
-                    best_run = j
-        penalty = np.float32(1.0) + kappa
-        limit = lowest / penalty
-        if not full:
-            for j in range(n):
-                for e in range(1, exemplar.lists.shape[1]):
-                    texel = exemplar.lists[owners[j], e]
-                    if compared[texel] == i:
-                        continue
-                    compared[texel] = i
-                    found += 1
-                    distance = _two_levels(texel, *pair, limit)
-                    if distance < limit:
-                        limit = distance
-                        best_distance = distance
-                        best = texel
-                        best_run = j
-            if best < 0:
-                tally[FALLBACKS] += 1
-        if full or best < 0:
-            for r in range(low, high):
-                for c in range(left, right):
-                    texel = r * exemplar.cols + c
-                    if compared[texel] == i:
-                        continue
-                    found += 1
-                    distance = _two_levels(texel, *pair, limit)
-                    if distance < limit:
-                        limit = distance
-                        best_distance = distance
-                        best = texel
-                        best_run = -1
+        found = list_candidates(
+            owners, n, support, kappa, full, exemplar, compared, i, tries, origin, penalty
+        )
+        if origin[0] < 0 and not full:
+            tally[FALLBACKS] += 1
+        m, distance = _choose(tries, penalty, found, *pair)
+        best = tries[m]
+        best_run = origin[m]
         r0 = best // exemplar.cols
         c0 = best - r0 * exemplar.cols
         if texel_under(row[v], col[v], exemplar) != best:
@@ -287,7 +320,7 @@ def grow(
         label[v] = exemplar.fine.labels[r0 + exemplar.fine.side // 2, c0 + exemplar.fine.side // 2]
         done[v] = True
         tally[CANDIDATES] += found
-        distances[v] = best_distance
+        distances[v] = distance
 
 
 @njit(cache=True, nogil=True)
