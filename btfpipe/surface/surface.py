@@ -77,7 +77,14 @@ class Surface:
         """Write the Surface."""
         arrays = {}
         for i, level in enumerate(self.levels):
-            for name in ("vertices", "faces", "normals", "tangents", "parent_face", "parent_weights"):
+            for name in (
+                "vertices",
+                "faces",
+                "normals",
+                "tangents",
+                "parent_face",
+                "parent_weights",
+            ):
                 if getattr(level, name) is not None:
                     arrays[f"level{i}_{name}"] = getattr(level, name)
         about = {k: v for k, v in self.about.items() if k not in ("kind", "format", "btfpipe")}
