@@ -43,7 +43,9 @@ test: $(READY)
 test-slow: $(READY)
 	$(BIN)/python -m pytest
 
+# Peers that the benchmarks time themselves against are installed here only.
 bench: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench,test,lint]"
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -s -q
 
 lint: $(READY)
