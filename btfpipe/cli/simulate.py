@@ -38,7 +38,8 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
     """Ray-trace the meso-structure of SPEC (YAML) into a measurement.
 
     OUT is a zip if its name ends in .zip, else a folder; `ingest` reads either. Pictures hold masking, parallax, cast
-    shadows and inter-reflection; the scale is absolute.
+    shadows and inter-reflection; the scale is absolute. The structure is drawn from the specification's own seed,
+    --seed draws the paths of the light.
 
     \b
     Example:

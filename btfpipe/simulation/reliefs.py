@@ -138,14 +138,12 @@ def weave(t, s, size, rng, *, warp, weft, pattern, width, thickness_mm, crimp, t
     a_s = s * warp + bend * smooth_noise(rng, (4, 4), t, s)
     a_t = t * weft + bend * smooth_noise(rng, (4, 4), t, s)
     over = pattern[np.arange(weft)[:, None] % len(pattern), np.arange(warp) % pattern.shape[1]]
-    pitch = min(size[1] / warp, size[0] / weft)
     warp_z, warp_id, warp_fibre = _threads(
         a_s, a_t, t, over.T, warp, weft, width, crimp, twist, irregularity, rng
     )
     weft_z, weft_id, weft_fibre = _threads(
         a_t, a_s, s, -over, weft, warp, width, crimp, twist, irregularity, rng
     )
-    del pitch
     scale = thickness_mm / 2
     warp_z, weft_z = warp_z * scale, weft_z * scale
     lint = fractal_noise(rng, _cells(size, 0.5), t, s)
