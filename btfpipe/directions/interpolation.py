@@ -51,7 +51,7 @@ class Hemisphere:
     """
 
     def __init__(self, directions, method="barycentric"):
-        vectors = np.ascontiguousarray(directions, dtype=np.float64)
+        vectors = np.array(directions, dtype=np.float64)
         if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) == 0:
             raise InputError(f"directions have shape {vectors.shape}; expected (n, 3), n >= 1.")
         if not np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-4):

@@ -1,5 +1,6 @@
 """Shading straight from a Sample, and the interpolation weights that every shader of a product shares."""
 
+import functools
 import os
 
 import numpy as np
@@ -133,8 +134,12 @@ class PairWeights:
 
     def __init__(self, appearance, interpolation):
         appearance.require_product("shading")
-        self.lights = Hemisphere(appearance.light_directions, interpolation).tables
-        self.views = Hemisphere(appearance.view_directions, interpolation).tables
+        self.lights = _tables(
+            np.asarray(appearance.light_directions, np.float64).tobytes(), interpolation
+        )
+        self.views = _tables(
+            np.asarray(appearance.view_directions, np.float64).tobytes(), interpolation
+        )
         self.inverse_cosines = 1 / light_cosines(appearance.light_directions)
         self.most = {"barycentric": 9, "four": 16, "nearest": 1}[interpolation]
 
@@ -158,6 +163,12 @@ class PairWeights:
                 self.inverse_cosines, w_i[part], index[:, :n], weight[:, :n], pair[:n], share[:n]
             )
             yield part, pair[:n], share[:n]
+
+
+@functools.lru_cache(maxsize=16)
+def _tables(directions, interpolation):
+    """Tables of a set of directions (its float64 bytes), kept: `evaluate` makes a shader at each call."""
+    return Hemisphere(np.frombuffer(directions).reshape(-1, 3), interpolation).tables
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
