@@ -73,14 +73,14 @@ class _Plane(click.ParamType):
 @click.option(
     "--coherence",
     type=click.FloatRange(min=0),
-    default=1.0,
+    default=0.6,
     show_default=True,
     help="By how much nearer a texel must be that breaks a run; 0: not at all, as published.",
 )
 @click.option(
     "--sweeps",
     type=(click.IntRange(min=1), click.IntRange(min=1)),
-    default=(16, 2),
+    default=(16, 3),
     show_default=True,
     help="Walks over the coarsest level, and over each other level.",
 )

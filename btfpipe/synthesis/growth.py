@@ -23,8 +23,8 @@ from btfpipe.synthesis.coordinate_map import CoordinateMap
 from btfpipe.synthesis.exemplar import cut, exemplar
 
 _BLOCK = 4096  # vertices flattened at once: about 8 MB
-SWEEPS = (16, 2)  # on the coarsest level, on the others
-COHERENCE = 1.0
+SWEEPS = (16, 3)  # on the coarsest level, on the others
+COHERENCE = 0.6
 
 Grown = namedtuple("Grown", "row col label")
 
@@ -51,8 +51,9 @@ def grow_over_surface(
     sweeps : (int, int)
         Times that the coarsest level and every other level are walked.
     coherence : float
-        By how much the distance of a texel counts more if no run of the patch leads to it; on all levels but the coarsest, which
-        finds the structure. 0 is the paper's choice: the nearest candidate, whatever it breaks.
+        By how much the distance of a texel counts more if no run of the patch leads to it: on level 0, half as much a level
+        from there on, and not at all on the coarsest, which finds the structure. 0 is the paper's choice: the nearest
+        candidate, whatever it breaks.
     turn : float
         Angle of the sample's s axis against the vector field, counter-clockwise, radians.
     seed, threads : int
@@ -116,7 +117,7 @@ def grow_over_surface(
                 tick = time.perf_counter()
                 search.grow(
                     *job, sample, full, below is None and sweep == 0,
-                    np.float32(0.0 if below is None else coherence), *state, done, *times, coarse_label, tally,
+                    np.float32(0.0 if below is None else coherence * 2.0**-i), *state, done, *times, coarse_label, tally,
                 )  # fmt: skip
                 searching += time.perf_counter() - tick
                 finished += len(job[0])

@@ -87,7 +87,7 @@ def grow_over_plane(
                 last = min(first + _ROWS, rows)
                 grow_rows(
                     first, last, where, canvas, coarse, done, distances, sample, full,
-                    np.float32(0.0 if below is None else coherence), tally,
+                    np.float32(0.0 if below is None else coherence * 2.0**-i), tally,
                 )  # fmt: skip
                 finished += (last - first) * cols
                 if on_progress is not None:
