@@ -21,7 +21,7 @@ def source_digest(*parts):
     files = set()
     for part in parts or (".",):
         path = root / part
-        files.update(path.rglob("*.py") if path.is_dir() else [path])
+        files.update([*path.rglob("*.py"), *path.rglob("*.yaml")] if path.is_dir() else [path])
     digest = hashlib.sha256()
     for path in sorted(files):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())

@@ -35,6 +35,19 @@ wildcard_constraints:
     scene="|".join(map(re.escape, config["scenes"])),
 
 
+def code(*parts):
+    """Digest of the code that a stage leans on; a change of it makes the stage run again."""
+    common = (
+        "store.py",
+        "parallel.py",
+        "hashing.py",
+        "directions",
+        "sample",
+        "formats",
+    )
+    return source_digest("cli/options.py", *common, *parts)
+
+
 def at(pattern):
     """Path of a result."""
     return f"{RESULTS}/{pattern}"

@@ -20,7 +20,7 @@ rule compare_model:
     resources:
         mem_mb=2000,
     params:
-        code=source_digest("metrics", "compression", "sample", "cli/compare.py"),
+        code=code("metrics", "compression", "cli/compare.py"),
     message:
         "comparing the Model of {wildcards.sample} with its Sample"
     shell:
@@ -50,9 +50,7 @@ rule compare_truth:
     resources:
         mem_mb=2000,
     params:
-        code=source_digest(
-            "metrics", "directions", "compression", "sample", "cli/compare.py"
-        ),
+        code=code("metrics", "compression", "cli/compare.py"),
     message:
         "comparing the {wildcards.what} of {wildcards.sample} with the truth between its directions"
     shell:
@@ -82,8 +80,6 @@ rule fidelity:
         at("benchmarks/fidelity.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    params:
-        code=source_digest("provenance.py"),
     message:
         "gathering the errors into one table"
     script:

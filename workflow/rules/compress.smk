@@ -16,7 +16,7 @@ rule compress:
     params:
         components=lookup("compress/components", within=config),
         seed=lookup("seed", within=config),
-        code=source_digest("compression", "sample", "cli/compress.py", "store.py"),
+        code=code("compression", "cli/compress.py"),
     message:
         "compressing {wildcards.sample} to {params.components} terms"
     shell:

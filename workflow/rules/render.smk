@@ -21,7 +21,7 @@ rule render:
         height=lookup("film/height", within=config),
         samples=lookup("film/samples", within=config),
         seed=lookup("seed", within=config),
-        code=source_digest("rendering", "compression", "sample", "cli/render.py"),
+        code=code("rendering", "compression", "surface", "synthesis", "cli/render.py"),
     message:
         "rendering {wildcards.look} in scene {wildcards.scene}"
     shell:
@@ -69,7 +69,7 @@ rule preview:
     resources:
         mem_mb=1000,
     params:
-        code=source_digest("rendering", "cli/preview.py"),
+        code=code("rendering", "cli/preview.py"),
     message:
         "tone-mapping {wildcards.look} in scene {wildcards.scene}"
     shell:
@@ -97,7 +97,7 @@ rule preview_btf_and_texture:
     resources:
         mem_mb=1000,
     params:
-        code=source_digest("rendering", "cli/preview.py"),
+        code=code("rendering", "cli/preview.py"),
     message:
         "setting {wildcards.look} beside its plain texture"
     shell:

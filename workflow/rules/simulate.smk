@@ -19,7 +19,7 @@ rule simulate_truth:
     resources:
         mem_mb=2000,
     params:
-        code=source_digest("simulation", "cli/simulate.py", "store.py", "formats"),
+        code=code("simulation", "cli/simulate.py"),
     message:
         "simulating {wildcards.sample} at directions that nobody measured"
     shell:

@@ -19,7 +19,7 @@ rule surface:
         field=lambda wildcards, input: option("--field", input.field or None),
         levels=lookup("textons/levels", within=config),
         seed=lookup("seed", within=config),
-        code=source_digest("surface", "cli/surface.py", "formats", "store.py"),
+        code=code("surface", "cli/surface.py"),
     message:
         "resampling {wildcards.surface} to {params.vertices} vertices"
     shell:

@@ -21,7 +21,7 @@ rule synthesize:
             "--texels-per-unit", LOOKS[wildcards.look].get("texels_per_unit")
         ),
         seed=lookup("seed", within=config),
-        code=source_digest("synthesis", "surface", "analysis", "cli/synthesize.py"),
+        code=code("synthesis", "surface", "analysis", "cli/synthesize.py"),
     message:
         "growing {wildcards.look}"
     shell:

@@ -18,7 +18,7 @@ rule textons:
         images=lookup("textons/images", within=config),
         levels=lookup("textons/levels", within=config),
         seed=lookup("seed", within=config),
-        code=source_digest("analysis", "compression", "cli/textons.py", "store.py"),
+        code=code("analysis", "compression", "cli/textons.py"),
     message:
         "extracting {params.textons} surface textons of {wildcards.sample}"
     shell:
