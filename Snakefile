@@ -9,7 +9,10 @@ from snakemake.utils import min_version
 min_version("9.12")
 
 
-configfile: "config/sample.yaml"
+# --configfile merges into what stands here, so a run of one's own must not find the sample's materials in it.
+if not config:
+
+    configfile: "config/sample.yaml"
 
 
 report: "workflow/report/workflow.rst"

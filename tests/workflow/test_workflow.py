@@ -38,7 +38,7 @@ def change(workdir, **entries):
     """Write a config that is the sample's with some entries replaced."""
     config = yaml.safe_load((workdir / "config/sample.yaml").read_text()) | entries
     path = workdir / "changed.yaml"
-    path.write_text(yaml.safe_dump(config))
+    path.write_text(yaml.safe_dump(config, sort_keys=False))
     return path
 
 
