@@ -73,7 +73,7 @@ class _Plane(click.ParamType):
 @click.option(
     "--coherence",
     type=click.FloatRange(min=0),
-    default=0.6,
+    default=0.4,
     show_default=True,
     help="By how much nearer a texel must be that breaks a run; 0: not at all, as published.",
 )

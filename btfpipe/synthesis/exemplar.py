@@ -119,6 +119,11 @@ def _tables(level, side, toroidal, distance):
         few = level.gram is not None or len(level.vectors) <= TABLE_LIMIT
         distance = "gram" if few else "vectors"
     if distance == "gram":
+        if level.gram is None and len(level.vectors) > 4 * TABLE_LIMIT:
+            raise InputError(
+                f"a dot-product matrix of {len(level.vectors)} vectors would take"
+                f" {len(level.vectors) ** 2 * 4 / 2**30:.1f} GiB; leave --distance out, or make textons of them."
+            )
         table = _square_distances(level)
         return _with_views(side, labels, table, np.zeros((0, 0, 0), np.float32), none)
     vectors = np.ascontiguousarray(level.vectors, np.float32)

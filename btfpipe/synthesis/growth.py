@@ -24,7 +24,7 @@ from btfpipe.synthesis.exemplar import cut, exemplar
 
 _BLOCK = 4096  # vertices flattened at once: about 8 MB
 SWEEPS = (16, 3)  # on the coarsest level, on the others
-COHERENCE = 0.6
+COHERENCE = 0.4
 
 Grown = namedtuple("Grown", "row col label")
 
@@ -79,6 +79,8 @@ def grow_over_surface(
             f"the surface has {len(surface.levels)} levels, fewer than --levels {levels}; lower it, or make more"
             " with `btfpipe surface`."
         )
+    for i in range(levels - 1):
+        _require_places(surface, i)
     spacing = mean_edge(surface.levels[0])
     scale = scale_for(surface, features.levels[0].shape, texels_per_unit)
     if not 0.25 <= scale * spacing <= 4.0:
@@ -135,6 +137,21 @@ def grow_over_surface(
         {"surface": surface.digest},
         about={"synthesis": report},
     )
+
+
+def _require_places(surface, i):
+    """Refuse a surface without usable places on the next coarser level."""
+    face, below = surface.levels[i].parent_face, len(surface.levels[i + 1].faces)
+    if face is None:
+        raise InputError(
+            f"the surface does not say where the vertices of level {i} lie on level {i + 1}; make it anew with"
+            " `btfpipe surface`, or pass --levels 1."
+        )
+    if face.min() < 0 or face.max() >= below:
+        raise InputError(
+            f"level {i} of the surface names face {face.min() if face.min() < 0 else face.max()} of level"
+            f" {i + 1}, which has {below}; make it anew with `btfpipe surface`."
+        )
 
 
 class _Flatten:

@@ -189,3 +189,20 @@ def test_a_scale_far_from_the_mesh_is_refused(sphere_surface, make_features):
 def test_more_levels_than_the_surface_has_are_refused(grid, make_features):
     with pytest.raises(InputError, match="the surface has 1 levels, fewer than --levels 2"):
         grow_over_surface(make_features(levels=2), one_level(grid(9, 9)), 1.0, k=5, levels=2)
+
+
+def test_a_surface_without_usable_places_is_refused(grid, make_features):
+    features = make_features(levels=2)
+    fine, coarse = grid(9, 9), grid(5, 5, 2.0)
+    with pytest.raises(InputError, match="does not say where the vertices of level 0"):
+        grow_over_surface(features, Surface([fine, coarse]), 1.0, k=5, levels=2)
+    fine.parent_face = np.full(81, 32, np.int32)
+    fine.parent_weights = np.full((81, 3), 1 / 3, np.float32)
+    with pytest.raises(InputError, match="names face 32 of level 1, which has 32"):
+        grow_over_surface(features, Surface([fine, coarse]), 1.0, k=5, levels=2)
+
+
+def test_a_dot_product_matrix_of_every_texel_is_refused(grid, make_features):
+    features = make_features(rows=100, cols=100, k=None)
+    with pytest.raises(InputError, match="10001 vectors would take"):
+        grow_over_surface(features, one_level(grid(9, 9)), 1.0, k=1, levels=1, distance="gram")
