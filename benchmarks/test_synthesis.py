@@ -12,7 +12,10 @@ from btfpipe.analysis.neighbours import add_neighbour_lists
 from btfpipe.analysis.pyramid import halve, plain_features
 from btfpipe.analysis.textons import cluster, texton_level
 from btfpipe.surface import Level, Surface
-from btfpipe.synthesis.growth import grow_over_surface
+from btfpipe.surface.flatten import Flattener, Patches
+from btfpipe.synthesis import search
+from btfpipe.synthesis.exemplar import exemplar
+from btfpipe.synthesis.growth import breadth_first, grow_over_surface, mean_edge
 from btfpipe.synthesis.plane import grow_over_plane
 
 
@@ -122,19 +125,53 @@ def test_k_coherent_against_full_search_on_a_surface(benchmark, side, wanted):
 
 @pytest.mark.parametrize("side", [64, 128])
 def test_distances_on_one_level(benchmark, side):
-    """How near k-coherent neighbourhoods come to those of full search, on one level."""
-    features, surface = textons(side, levels=1), sphere_surface(3000, 1)
-    options = {"levels": 1, "sweeps": (4, 1), "seed": 1}
-    distances = {
-        k: grow_over_surface(features, surface, k=k, **options).about["synthesis"][-1]["mean_distance"]
-        for k in (1, 4, 11, 30, 60)
-    }  # fmt: skip
-    full = grow_over_surface(features, surface, full=True, **options)
-    full = full.about["synthesis"][-1]["mean_distance"]
-    for k, distance in distances.items():
-        say(f"  one level, {side}², k {k:2d}: mean distance {distance / full:.3f} of full search's")
-        benchmark.extra_info[f"k{k}_of_full"] = round(distance / full, 3)
-    benchmark.pedantic(grow_over_surface, (features, surface), {"k": 11, **options}, rounds=1)
+    """How near the k-coherent choice comes to the nearest of all texels, for the same neighbourhoods on one level.
+
+    The texture grows by full search; at every vertex each k chooses too, from the same surroundings.
+    """
+    features, level = textons(side, levels=1), sphere(1500)
+    mesh = Flattener(level, 1 / mean_edge(level))
+    order = breadth_first(mesh)
+    patches = mesh.squares(order, 5)
+    none = np.zeros((0, 0, 3), np.int32), np.zeros((0, 0, 3), np.float32)
+    n = len(order)
+    state = [
+        np.zeros(n, np.float32),
+        np.zeros(n, np.float32),
+        np.zeros(n, np.int32),
+        np.zeros(n, bool),
+    ]
+    ks = (1, 2, 4, 8, 11, 20, 40, 60)
+    samples = {k: exemplar(features, 0, k) for k in ks}
+    samples["full"] = exemplar(features, 0)
+    distances = {k: np.zeros(n, np.float32) for k in samples}
+    tallies = {k: np.zeros(5, np.int64) for k in samples}
+    state[0][:] = state[1][:] = side // 2
+
+    def choose(i, k):
+        v = order[i]
+        times = np.zeros(n, np.int64), np.ones(n, np.int64), distances[k]
+        before = [a[v] for a in state]
+        one = Patches(*(a[i : i + 1] for a in patches))
+        search.grow(
+            order[i : i + 1], one, *none, samples[k], k == "full", True, np.float32(0), *state, *times,
+            np.zeros(0, np.int32), tallies[k],
+        )  # fmt: skip
+        if k != "full":
+            for a, old in zip(state, before, strict=True):
+                a[v] = old
+
+    for i in range(n):
+        for k in samples:
+            choose(i, k)
+    full = distances["full"].mean()
+    for k in ks:
+        ratio, candidates = distances[k].mean() / full, tallies[k][search.CANDIDATES] / n
+        say(
+            f"  one level, {side}², k {k:2d}: {candidates:6.1f} candidates, distance {ratio:.3f} of full search's"
+        )
+        benchmark.extra_info[f"k{k}_of_full"] = round(float(ratio), 3)
+    benchmark.pedantic(choose, (n - 1, "full"), rounds=1)
 
 
 class NumpySweep:
