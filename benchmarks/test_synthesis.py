@@ -234,9 +234,12 @@ class NumpySweep:
         return r + 1, spent / ((r + 1) * self.row.shape[1])
 
 
-def test_plane_against_numpy(benchmark):
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_plane_against_numpy(benchmark, noise):
     """A sweep with whole neighbourhoods, k = 8, 5 x 5, 8 channels, toroidal output, on one thread."""
-    features = plain_features(smooth(64, 8), False, 1)
+    image = smooth(64, 8)
+    rough = np.random.default_rng(2).normal(scale=noise, size=image.shape)
+    features = plain_features(image + rough, False, 1)
     add_neighbour_lists(features, 8)
     shape = (128, 128)
     options = {"k": 8, "levels": 1, "seed": 1, "distance": "vectors"}

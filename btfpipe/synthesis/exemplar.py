@@ -171,15 +171,6 @@ def texel_under(row, col, exemplar):
 
 
 @njit(cache=True, inline="always")
-def is_inside(texel, exemplar):
-    """Whether the texel's neighbourhoods lie inside the sample."""
-    r = texel // exemplar.cols
-    c = texel - r * exemplar.cols
-    low, high, left, right = exemplar.inside
-    return low <= r < high and left <= c < right
-
-
-@njit(cache=True, inline="always")
 def wrapped(x, size):
     """The coordinate moved by whole periods into [-0.5, size - 0.5)."""
     return x - size * np.floor((x + 0.5) / size)
@@ -191,7 +182,6 @@ __all__ = [
     "coarse_texel",
     "cut",
     "exemplar",
-    "is_inside",
     "texel_under",
     "wrapped",
 ]

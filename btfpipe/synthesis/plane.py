@@ -76,10 +76,9 @@ def grow_over_plane(
             coarse = _canvas(sample.coarse, below)
         canvas = _canvas(sample.fine, texel)
         half = side // 2
-        where = np.stack([texel // sample.cols, texel % sample.cols], axis=2).astype(np.int32)
-        where = np.pad(where, ((half, half), (half, half), (0, 0)), "wrap")
+        where = tuple(np.pad(a, half, "wrap") for a in np.divmod(texel, np.int32(sample.cols)))
         distances = np.zeros((rows, cols), np.float32)
-        done = np.full(where.shape[:2], below is not None)
+        done = np.full(where[0].shape, below is not None)
         for sweep in range(sweeps[0] if below is None else sweeps[1]):
             tally = np.zeros(5, np.int64)
             start = time.perf_counter()
@@ -94,11 +93,11 @@ def grow_over_plane(
                     on_progress(finished, total)
             seconds = time.perf_counter() - start
             report.append(summary(i, sweep, tally, distances, seconds, seconds))
-        where = where[half:-half, half:-half] if half else where
-        below, coarse_sample = where[..., 0] * sample.cols + where[..., 1], sample
+        row, col = (a[half : half + rows, half : half + cols] for a in where)
+        below, coarse_sample = row * sample.cols + col, sample
     return CoordinateMap(
-        where[..., 0].reshape(1, -1),
-        where[..., 1].reshape(1, -1),
+        row.reshape(1, -1),
+        col.reshape(1, -1),
         np.zeros((1, below.size), np.float32),
         1.0,
         {"plane": [int(n) for n in shape], "toroidal": True},
@@ -190,12 +189,13 @@ def _choose(
     ours1, our_image1, our_width1 = coarse_canvas
     labels1, table1, image1, width1, n1, depth1 = coarse_flat
     whole = places.shape[0] == side * side
+    inverse = 1.0 / cols
     best = 0
     best_distance = np.float32(np.inf)
     lowest = np.float32(np.inf)
     for m in range(count):
         limit = lowest / penalty[m]
-        s = tries[m] // cols
+        s = int((tries[m] + 0.5) * inverse)  # an integer division costs more
         e = tries[m] - s * cols
         total = np.float32(0.0)
         if coarse_side > 0:
@@ -229,7 +229,7 @@ def grow_rows(
 
     Parameters
     ----------
-    where : (rows + side - 1, cols + side - 1, 2) int32
+    where : two (rows + side - 1, cols + side - 1) int32
         Row and col in the sample of each texel of the output, with a border that continues it; changed in place.
     canvas, coarse_canvas : (labels, image, width)
         What the output looks like on this level and the coarser one, flat, with the same border; this level's is kept up to date.
@@ -246,10 +246,13 @@ def grow_rows(
     half = side // 2
     rows, cols = distances.shape
     width = cols + 2 * half
+    row, col = where
+    flat_row, flat_col, flat_done = row.ravel(), col.ravel(), done.ravel()
     our_labels, our_image, _ = canvas
     labels, _, image, sample_width, _, depth = sample.fine.flat
     sample_rows, sample_cols = sample.rows, sample.cols
     toroidal = sample.toroidal
+    lists, inside = sample.lists, sample.inside
     compared = np.full(sample_rows * sample_cols, -1, np.int32)
     slot = np.empty(sample_rows * sample_cols, np.int32)
     places = np.empty((side * side, 2), np.int32)
@@ -267,21 +270,27 @@ def grow_rows(
             stamp = r * cols + c
             count = 0
             n = 0
+            last_texel = -1
             for i in range(side):
                 for j in range(side):
-                    if not done[r + i, c + j]:
+                    place = np.uint64((r + i) * width + c + j)
+                    if not flat_done[place]:
                         continue
                     places[count, 0] = i
                     places[count, 1] = j
                     count += 1
-                    s = where[r + i, c + j, 0] + half - i
-                    e = where[r + i, c + j, 1] + half - j
+                    s = flat_row[place] + half - i
+                    e = flat_col[place] + half - j
                     if toroidal:  # a sample has at least `side` texels: one period is enough
                         s += sample_rows if s < 0 else (-sample_rows if s >= sample_rows else 0)
                         e += sample_cols if e < 0 else (-sample_cols if e >= sample_cols else 0)
                     elif s < 0 or s >= sample_rows or e < 0 or e >= sample_cols:
                         continue
                     t = s * sample_cols + e
+                    if t == last_texel:  # most runs lead to the same one
+                        support[slot[t]] += np.float32(1.0)
+                        continue
+                    last_texel = t
                     if compared[t] == stamp:
                         support[slot[t]] += np.float32(1.0)
                     else:
@@ -290,7 +299,7 @@ def grow_rows(
                         owners[n] = t
                         support[n] = np.float32(1.0)
                         n += 1
-            old = where[r + half, c + half, 0] * sample_cols + where[r + half, c + half, 1]
+            old = row[r + half, c + half] * sample_cols + col[r + half, c + half]
             best = old
             if count == 0:
                 tally[STARTS] += 1
@@ -298,7 +307,19 @@ def grow_rows(
                 for j in range(n):
                     support[j] /= count
                 found = list_candidates(
-                    owners, n, support, kappa, full, sample, compared, stamp, tries, origin, penalty
+                    owners,
+                    n,
+                    support,
+                    kappa,
+                    full,
+                    lists,
+                    sample_cols,
+                    inside,
+                    compared,
+                    stamp,
+                    tries,
+                    origin,
+                    penalty,
                 )
                 if origin[0] < 0 and not full:
                     tally[FALLBACKS] += 1
@@ -314,8 +335,8 @@ def grow_rows(
             for i in range((r + half) % rows, rows + 2 * half, rows):
                 for j in range((c + half) % cols, cols + 2 * half, cols):
                     done[i, j] = True
-                    where[i, j, 0] = s
-                    where[i, j, 1] = e
+                    row[i, j] = s
+                    col[i, j] = e
                     place = i * width + j
                     our_labels[place] = labels[texel]
                     for d in range(depth):

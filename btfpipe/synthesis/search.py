@@ -12,7 +12,7 @@ the same distance blends feature vectors instead; it serves plain feature images
 import numpy as np
 from numba import njit
 
-from btfpipe.synthesis.exemplar import coarse_texel, is_inside, texel_under, wrapped
+from btfpipe.synthesis.exemplar import coarse_texel, texel_under, wrapped
 
 CLOCK, CANDIDATES, FALLBACKS, STARTS, MOVED = range(5)  # places in the tally
 _FAST = {"reassoc", "contract", "nsz"}
@@ -151,7 +151,7 @@ def _choose(tries, penalty, count, cols, coarse_side, coarse_sample, coarse, sid
 
 @njit(cache=True, nogil=True)
 def list_candidates(
-    owners, n, support, kappa, full, exemplar, compared, stamp, tries, origin, penalty
+    owners, n, support, kappa, full, lists, cols, inside, compared, stamp, tries, origin, penalty
 ):  # fmt: skip
     """The texels to compare: first those that runs lead to, then their lists, or all texels.
 
@@ -161,6 +161,8 @@ def list_candidates(
         Texels that the runs lead to, marked as compared, and the share of the runs that do.
     kappa, full
         As in `grow`.
+    lists, cols, inside
+        Of the `Exemplar`.
     compared : (texels,) int32
         Holds `stamp` for texels already listed.
     tries, origin, penalty : (at least all that can be listed,) int32, int32, float32
@@ -171,14 +173,16 @@ def list_candidates(
     int
         Number listed.
     """
+    low, high, left, right = inside
     count = 0
     for j in range(n):
-        if is_inside(owners[j], exemplar):
+        r = owners[j] // cols
+        c = owners[j] - r * cols
+        if low <= r < high and left <= c < right:
             tries[count] = owners[j]
             origin[count] = j
             penalty[count] = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
             count += 1
-    lists = exemplar.lists
     if not full:
         for j in range(n):
             for e in range(1, lists.shape[1]):
@@ -190,10 +194,9 @@ def list_candidates(
                     penalty[count] = np.float32(1.0) + kappa
                     count += 1
     if full or count == 0:
-        low, high, left, right = exemplar.inside
         for r in range(low, high):
             for c in range(left, right):
-                texel = r * exemplar.cols + c
+                texel = r * cols + c
                 if compared[texel] != stamp:
                     tries[count] = texel
                     origin[count] = -1
@@ -300,7 +303,19 @@ def grow(
             moved[v] = tally[CLOCK]
             continue
         found = list_candidates(
-            owners, n, support, kappa, full, exemplar, compared, i, tries, origin, penalty
+            owners,
+            n,
+            support,
+            kappa,
+            full,
+            exemplar.lists,
+            exemplar.cols,
+            exemplar.inside,
+            compared,
+            i,
+            tries,
+            origin,
+            penalty,
         )
         if origin[0] < 0 and not full:
             tally[FALLBACKS] += 1
