@@ -266,7 +266,7 @@ def test_plane_against_numpy(benchmark, noise):
     }
     for name in least:
         say(
-            f"  plane, {name:8s}: {1 / least[name]:9,.0f} texels/s, {least[name] / least['own']:5.1f} x own"
+            f"  plane, {own['candidates']:.0f} candidates, {name:8s}: {1 / least[name]:9,.0f} texels/s, {least[name] / least['own']:5.1f} x own"
         )
 
 
