@@ -20,11 +20,13 @@ rule synthesize:
         scale=lambda wildcards: option(
             "--texels-per-unit", LOOKS[wildcards.look].get("texels_per_unit")
         ),
+        levels=lookup("textons/levels", within=config),
         seed=lookup("seed", within=config),
         code=code("synthesis", "surface", "analysis", "cli/synthesize.py"),
     message:
         "growing {wildcards.look}"
     shell:
         "btfpipe synthesize {input.features} {input.surface} -k {params.k}"
+        " --levels {params.levels}"
         " --turn-deg {params.turn} {params.scale} --seed {params.seed} --threads {threads}"
         " --out {output.map} --json > {output.summary} 2> {log}"
