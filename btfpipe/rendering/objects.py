@@ -6,11 +6,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe.errors import InputError
-from btfpipe.sample.orientation import step_to_texels
-
-TOLERANCE = (
-    0.25  # texels by which coordinates may miss the rigid motion and still count as one patch
-)
+from btfpipe.synthesis.coherence import find_coherent
 
 
 @dataclass
@@ -131,43 +127,6 @@ def dress(vertices, faces, normals, tangents, coordinates, appearance, interpola
         row, col, weight, axis, coherent, appearance.shader(interpolation), rows, cols,
         bool(appearance.toroidal),
     )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def find_coherent(
-    vertices, faces, normals, axis, row, col, texels_per_unit, rows, cols, toroidal, coherent
-):
-    """Mark the faces whose vertices come from one patch of the sample.
-
-    An edge of the face, seen in the sample's frame at one end, is a step in texels; the coordinates at its ends
-    must differ by that step, and the frames' turn against each other must move no end of it by more than the
-    tolerance. Fills `coherent` (faces,) bool.
-    """
-    for f in range(len(faces)):
-        good = True
-        for k in range(3):
-            a = faces[f, k]
-            b = faces[f, (k + 1) % 3]
-            sx, sy, sz = axis[a, 0], axis[a, 1], axis[a, 2]
-            nx, ny, nz = normals[a, 0], normals[a, 1], normals[a, 2]
-            tx, ty, tz = ny * sz - nz * sy, nz * sx - nx * sz, nx * sy - ny * sx
-            ex = (vertices[b, 0] - vertices[a, 0]) * texels_per_unit
-            ey = (vertices[b, 1] - vertices[a, 1]) * texels_per_unit
-            ez = (vertices[b, 2] - vertices[a, 2]) * texels_per_unit
-            drow, dcol = step_to_texels(
-                ex * sx + ey * sy + ez * sz, ex * tx + ey * ty + ez * tz, 0.0
-            )
-            drow -= row[b] - row[a]
-            dcol -= col[b] - col[a]
-            if toroidal:
-                drow -= np.round(drow / rows) * rows
-                dcol -= np.round(dcol / cols) * cols
-            cosine = axis[b, 0] * sx + axis[b, 1] * sy + axis[b, 2] * sz
-            sine = axis[b, 0] * tx + axis[b, 1] * ty + axis[b, 2] * tz
-            turn = np.arctan2(sine, cosine) * np.sqrt(ex * ex + ey * ey + ez * ez)
-            if drow * drow + dcol * dcol > TOLERANCE**2 or abs(turn) > TOLERANCE:
-                good = False
-        coherent[f] = good
 
 
 def plane_frame(plane):

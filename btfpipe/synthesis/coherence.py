@@ -1,10 +1,70 @@
 """How much of a coordinate map is made of whole pieces of the sample."""
 
 import numpy as np
+from numba import njit
 
+from btfpipe.sample.orientation import step_to_texels
 from btfpipe.surface.flatten import turned
 
 TOLERANCE = 0.25  # texels, by which a coherent step may differ from the vertices' own
+
+
+@njit(cache=True, nogil=True)
+def find_coherent(
+    vertices, faces, normals, axis, row, col, texels_per_unit, rows, cols, toroidal, coherent
+):
+    """Mark the faces whose vertices come from one patch of the sample; the renderer interpolates coordinates inside them.
+
+    An edge, seen in the frame half-way between its ends, is a step in texels; the coordinates at the ends must differ by
+    that step, and the frames' turn against each other must move no end of it by more than the tolerance.
+
+    Parameters
+    ----------
+    vertices, normals, axis : (n, 3) float
+        `axis` holds the sample's s axis at each vertex.
+    faces : (m, 3) int32
+    row, col : (n,) float32
+    texels_per_unit : float
+    rows, cols, toroidal
+        Of the sample.
+    coherent : (m,) bool
+        Filled in.
+    """
+    for f in range(len(faces)):
+        good = True
+        for k in range(3):
+            a = faces[f, k]
+            b = faces[f, (k + 1) % 3]
+            ex = (vertices[b, 0] - vertices[a, 0]) * texels_per_unit
+            ey = (vertices[b, 1] - vertices[a, 1]) * texels_per_unit
+            ez = (vertices[b, 2] - vertices[a, 2]) * texels_per_unit
+            length = np.sqrt(ex * ex + ey * ey + ez * ez)
+            s = 0.0
+            t = 0.0
+            for v in (a, b):
+                sx, sy, sz = axis[v, 0], axis[v, 1], axis[v, 2]
+                nx, ny, nz = normals[v, 0], normals[v, 1], normals[v, 2]
+                s += ex * sx + ey * sy + ez * sz
+                t += ex * (ny * sz - nz * sy) + ey * (nz * sx - nx * sz) + ez * (nx * sy - ny * sx)
+            flat = length / max(np.sqrt(s * s + t * t), 1e-12)  # the step keeps the edge's length
+            drow, dcol = step_to_texels(s * flat, t * flat, 0.0)
+            drow -= row[b] - row[a]
+            dcol -= col[b] - col[a]
+            if toroidal:
+                drow -= np.round(drow / rows) * rows
+                dcol -= np.round(dcol / cols) * cols
+            sx, sy, sz = axis[a, 0], axis[a, 1], axis[a, 2]
+            nx, ny, nz = normals[a, 0], normals[a, 1], normals[a, 2]
+            cosine = axis[b, 0] * sx + axis[b, 1] * sy + axis[b, 2] * sz
+            sine = (
+                axis[b, 0] * (ny * sz - nz * sy)
+                + axis[b, 1] * (nz * sx - nx * sz)
+                + axis[b, 2] * (nx * sy - ny * sx)
+            )
+            turn = np.arctan2(sine, cosine) * length
+            if drow * drow + dcol * dcol > TOLERANCE**2 or abs(turn) > TOLERANCE:
+                good = False
+        coherent[f] = good
 
 
 def coherent_triangles(level, row, col, texels_per_unit, shape, toroidal, turn=0.0):
@@ -26,21 +86,11 @@ def coherent_triangles(level, row, col, texels_per_unit, shape, toroidal, turn=0
     -------
     (m,) bool
     """
-    vertices, faces = np.asarray(level.vertices), np.asarray(level.faces)
-    tangents = turned(level, turn)
-    bitangents = np.cross(level.normals, tangents)
-    whole = np.ones(len(faces), bool)
-    for i in range(3):
-        a, b = faces[:, i], faces[:, (i + 1) % 3]
-        edge = (vertices[b] - vertices[a]) * texels_per_unit
-        s = np.einsum("nd,nd->n", edge, tangents[a] + tangents[b])
-        t = np.einsum("nd,nd->n", edge, bitangents[a] + bitangents[b])
-        stretch = np.linalg.norm(edge, axis=1) / np.maximum(np.hypot(s, t), 1e-12)
-        drow, dcol = row[b] - row[a] + stretch * t, col[b] - col[a] - stretch * s
-        if toroidal:
-            drow -= shape[0] * np.round(drow / shape[0])
-            dcol -= shape[1] * np.round(dcol / shape[1])
-        whole &= np.hypot(drow, dcol) <= TOLERANCE
+    whole = np.zeros(len(level.faces), np.bool_)
+    arrays = (level.vertices, level.faces, level.normals, turned(level, turn), row, col)
+    find_coherent(
+        *map(np.ascontiguousarray, arrays), float(texels_per_unit), *shape, bool(toroidal), whole
+    )
     return whole
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from btfpipe.errors import InputError
-from btfpipe.rendering.objects import dress, find_coherent, patch
+from btfpipe.rendering.objects import dress, patch
 from btfpipe.sample import Sample
 from btfpipe.synthesis import CoordinateMap
+from btfpipe.synthesis.coherence import find_coherent
 
 PLANE = {"center": [0, 0, 0], "s": [1, 0, 0], "t": [0, 1, 0], "size": [2, 2]}
 VIEW = {"type": "orthographic", "position": [0, 0, 5], "target": [0, 0, 0], "height": 2}
