@@ -53,28 +53,33 @@ def pebble():
     return made, faces
 
 
-def knot(around=150, across=12):
-    """A trefoil knot, 2.3 wide, of a round tube that swells and narrows a little."""
-    u = 2 * np.pi * np.arange(around)[:, None] / around
-    w = 2 * np.pi * np.arange(across)[None, :] / across
+def curve(u):
+    """The knot's centre line (..., 3) before scaling, at parameters u (...,) from 0 to 2 pi, and its direction."""
 
-    def curve(u):
+    def place(u):
         reach = 2 + 0.95 * np.cos(3 * u)
         return np.stack(
             [reach * np.cos(2 * u), reach * np.sin(2 * u), 1.05 * np.sin(3 * u)], axis=-1
         )
 
-    along = curve(u + 1e-4) - curve(u - 1e-4)
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    along = place(u + 1e-4) - place(u - 1e-4)
+    return place(u), along / np.linalg.norm(along, axis=-1, keepdims=True)
+
+
+def knot(around=150, across=12):
+    """A trefoil knot, 2.3 wide, of a round tube that swells and narrows a little."""
+    u = 2 * np.pi * np.arange(around)[:, None] / around
+    w = 2 * np.pi * np.arange(across)[None, :] / across
+    centre, along = curve(u)
     # away from the circle that the curve winds about: a frame that closes after one turn
     core = np.stack([2 * np.cos(2 * u), 2 * np.sin(2 * u), 0 * u], axis=-1)
-    out = curve(u) - core
+    out = centre - core
     out -= (out * along).sum(axis=-1, keepdims=True) * along
     out /= np.linalg.norm(out, axis=-1, keepdims=True)
     side = np.cross(along, out)
     thick = (0.6 + 0.06 * np.cos(3 * u))[..., None]
     around_tube = np.cos(w)[..., None] * out + np.sin(w)[..., None] * side
-    vertices = (curve(u) + thick * around_tube) / 3.1
+    vertices = (centre + thick * around_tube) / 3.1
     i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
     k, m = (i + 1) % around, (j + 1) % across
     a, b, c, d = i * across + j, k * across + j, k * across + m, i * across + m
@@ -82,8 +87,22 @@ def knot(around=150, across=12):
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
 
 
+def knot_strokes(count=60):
+    """Strokes along the knot's tube, one beside each of some vertices, as YAML for `btfpipe surface --field`."""
+    vertices, _ = knot()
+    pick = np.arange(count) * len(vertices) // count
+    across = len(vertices) // 150
+    _, along = curve(2 * np.pi * (pick // across) / 150)
+    lines = ["# Along the tube: the sample's s axis follows the knot.\n", "strokes:\n"]
+    for point, vector in zip(vertices[pick], along, strict=True):
+        point, vector = ([round(float(x), 4) + 0.0 for x in a] for a in (point, vector))
+        lines.append(f"  - {{point: {point}, vector: {vector}}}\n")
+    return "".join(lines)
+
+
 def main(folder):
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "knot-strokes.yaml").write_text(knot_strokes())
     write_obj(folder / "pebble.obj", *pebble())
     write_obj(folder / "knot.obj", *knot())
 
