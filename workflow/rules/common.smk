@@ -1,5 +1,6 @@
 # Validation, wildcards and targets; no rules.
 
+import shlex
 from pathlib import Path
 
 from snakemake.utils import validate
@@ -58,21 +59,19 @@ def option(flag, value):
     if value is None:
         return ""
     values = value if isinstance(value, (list, tuple)) else [value]
-    return " ".join([flag, *map(str, values)])
+    return " ".join([flag, *(shlex.quote(str(value)) for value in values)])
 
 
 def sample_options(wildcards):
     """Options of `btfpipe ingest` for a sample."""
     sample = config["samples"][wildcards.sample]
-    return " ".join(
-        filter(
-            None,
-            [
-                option("--transfer", sample.get("transfer")),
-                option("--crop", sample.get("crop")),
-            ],
-        )
-    )
+    keys = ("transfer", "crop", "size", "white")
+    flags = [option(f"--{key}", sample.get(key)) for key in keys]
+    if "toroidal" in sample:
+        flags.append("--toroidal" if sample["toroidal"] else "--not-toroidal")
+    if sample.get("flatten"):
+        flags.append("--flatten")
+    return " ".join(filter(None, flags))
 
 
 def of_look(key):

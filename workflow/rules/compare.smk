@@ -24,8 +24,8 @@ rule compare_model:
     message:
         "comparing the Model of {wildcards.sample} with its Sample"
     shell:
-        "btfpipe compare {input.model} {input.sample} --picture {output.picture}"
-        " --threads {threads} --out {output.numbers} --quiet 2> {log}"
+        "btfpipe compare {input.model:q} {input.sample:q} --picture {output.picture:q}"
+        " --threads {threads} --out {output.numbers:q} --quiet 2> {log:q}"
 
 
 rule compare_truth:
@@ -54,8 +54,8 @@ rule compare_truth:
     message:
         "comparing the {wildcards.what} of {wildcards.sample} with the truth between its directions"
     shell:
-        "btfpipe compare {input.appearance} {input.truth} --interpolation all"
-        " --threads {threads} --out {output.numbers} --quiet 2> {log}"
+        "btfpipe compare {input.appearance:q} {input.truth:q} --interpolation all"
+        " --threads {threads} --out {output.numbers:q} --quiet 2> {log:q}"
 
 
 rule fidelity:

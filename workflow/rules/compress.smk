@@ -20,6 +20,6 @@ rule compress:
     message:
         "compressing {wildcards.sample} to {params.components} terms"
     shell:
-        "btfpipe compress {input.sample} --method svd --components {params.components}"
+        "btfpipe compress {input.sample:q} --method svd --components {params.components}"
         " --seed {params.seed} --threads {threads}"
-        " --out {output.model} --json > {output.summary} 2> {log}"
+        " --out {output.model:q} --json > {output.summary:q} 2> {log:q}"

@@ -19,8 +19,8 @@ rule ingest:
     message:
         "ingesting {wildcards.sample}"
     shell:
-        "btfpipe ingest {input.source} {params.options}"
-        " --threads {threads} --out {output.sample} --json > {output.summary} 2> {log}"
+        "btfpipe ingest {input.source:q} {params.options}"
+        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule ingest_frontal:
@@ -44,8 +44,8 @@ rule ingest_frontal:
     message:
         "taking the frontal picture of {wildcards.sample}"
     shell:
-        "btfpipe ingest {input.source} --frontal {params.options}"
-        " --threads {threads} --out {output.sample} --json > {output.summary} 2> {log}"
+        "btfpipe ingest {input.source:q} --frontal {params.options}"
+        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule ingest_truth:
@@ -68,5 +68,5 @@ rule ingest_truth:
     message:
         "ingesting the ground truth of {wildcards.sample}"
     shell:
-        "btfpipe ingest {input.source} --pairs"
-        " --threads {threads} --out {output.sample} --json > {output.summary} 2> {log}"
+        "btfpipe ingest {input.source:q} --pairs"
+        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"

@@ -25,10 +25,10 @@ rule render:
     message:
         "rendering {wildcards.look} in scene {wildcards.scene}"
     shell:
-        "btfpipe render {input.scene} --bind surface={input.surface} --bind map={input.map}"
-        " --bind model={input.model} --width {params.width} --height {params.height}"
+        "btfpipe render {input.scene:q} --bind surface={input.surface:q} --bind map={input.map:q}"
+        " --bind model={input.model:q} --width {params.width} --height {params.height}"
         " --samples {params.samples} --seed {params.seed} --threads {threads}"
-        " --out {output.picture} --json > {output.summary} 2> {log}"
+        " --out {output.picture:q} --json > {output.summary:q} 2> {log:q}"
 
 
 # The same map with the frontal picture as an ordinary texture.
@@ -73,7 +73,7 @@ rule preview:
     message:
         "tone-mapping {wildcards.look} in scene {wildcards.scene}"
     shell:
-        "btfpipe preview {input.picture} --out {output.png} --quiet 2> {log}"
+        "btfpipe preview {input.picture:q} --out {output.png:q} --quiet 2> {log:q}"
 
 
 rule preview_btf_and_texture:
@@ -101,4 +101,4 @@ rule preview_btf_and_texture:
     message:
         "setting {wildcards.look} beside its plain texture"
     shell:
-        "btfpipe preview {input.btf} {input.plain} --columns 2 --out {output.png} --quiet 2> {log}"
+        "btfpipe preview {input.btf:q} {input.plain:q} --columns 2 --out {output.png:q} --quiet 2> {log:q}"

@@ -19,9 +19,10 @@ rule simulate_truth:
     resources:
         mem_mb=2000,
     params:
+        seed=lookup("seed", within=config),
         code=code("simulation", "cli/simulate.py"),
     message:
         "simulating {wildcards.sample} at directions that nobody measured"
     shell:
-        "btfpipe simulate {input.spec} --directions {input.pairs} --format exr"
-        " --threads {threads} --out {output.stack} --json > {output.summary} 2> {log}"
+        "btfpipe simulate {input.spec:q} --directions {input.pairs:q} --format exr --seed {params.seed}"
+        " --threads {threads} --out {output.stack:q} --json > {output.summary:q} 2> {log:q}"

@@ -17,12 +17,15 @@ rule surface:
     params:
         vertices=lambda wildcards: config["surfaces"][wildcards.surface]["vertices"],
         field=lambda wildcards, input: option("--field", input.field or None),
+        crease=lambda wildcards: option(
+            "--crease-deg", config["surfaces"][wildcards.surface].get("crease_deg")
+        ),
         levels=lookup("textons/levels", within=config),
         seed=lookup("seed", within=config),
         code=code("surface", "cli/surface.py"),
     message:
         "resampling {wildcards.surface} to {params.vertices} vertices"
     shell:
-        "btfpipe surface {input.mesh} --vertices {params.vertices} {params.field}"
+        "btfpipe surface {input.mesh:q} --vertices {params.vertices} {params.field} {params.crease}"
         " --levels {params.levels} --seed {params.seed} --threads {threads}"
-        " --out {output.surface} --json > {output.summary} 2> {log}"
+        " --out {output.surface:q} --json > {output.summary:q} 2> {log:q}"

@@ -26,7 +26,7 @@ rule synthesize:
     message:
         "growing {wildcards.look}"
     shell:
-        "btfpipe synthesize {input.features} {input.surface} -k {params.k}"
+        "btfpipe synthesize {input.features:q} {input.surface:q} -k {params.k}"
         " --levels {params.levels}"
         " --turn-deg {params.turn} {params.scale} --seed {params.seed} --threads {threads}"
-        " --out {output.map} --json > {output.summary} 2> {log}"
+        " --out {output.map:q} --json > {output.summary:q} 2> {log:q}"

@@ -22,6 +22,6 @@ rule textons:
     message:
         "extracting {params.textons} surface textons of {wildcards.sample}"
     shell:
-        "btfpipe textons {input.model} --textons {params.textons} --images {params.images}"
+        "btfpipe textons {input.model:q} --textons {params.textons} --images {params.images}"
         " --levels {params.levels} --seed {params.seed} --threads {threads}"
-        " --out {output.features} --json > {output.summary} 2> {log}"
+        " --out {output.features:q} --json > {output.summary:q} 2> {log:q}"
