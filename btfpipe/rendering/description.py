@@ -3,6 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
+from btfpipe import description
 from btfpipe.errors import InputError
 
 
@@ -24,19 +25,15 @@ def read_description(path, bindings=None):
     Raises
     ------
     InputError
-        If the file cannot be read, a key is unknown, missing or has an unusable value, there is no light, a
-        placeholder has no binding, or a file does not exist.
+        If the file cannot be read or is not YAML, a key is unknown, missing, given twice or has an unusable value
+        (a number that is not finite among them), there is no light, a placeholder has no binding, or a file does
+        not exist.
     """
     import jsonschema
     import yaml
 
     path = Path(path)
-    try:
-        scene = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}).") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({' '.join(str(error).split())}).") from error
+    scene = description.read_description(path, "a scene")
     schema = yaml.safe_load(
         resources.files("btfpipe.rendering").joinpath("scene.schema.yaml").read_text("utf-8")
     )
@@ -73,6 +70,11 @@ def _explain(error, prefix=()):
     """One sentence on a schema error: where, what was found, what was expected."""
     path = [*prefix, *error.path] if not prefix else list(prefix)
     if error.validator == "oneOf" and error.context:
+        kinds = [e for e in error.context if e.validator == "const"]
+        if len(kinds) == len(error.validator_value):  # it names no kind that there is
+            where = _where([*path, *kinds[0].path])
+            expected = " or ".join(repr(e.validator_value) for e in kinds)
+            return f"{where} is {kinds[0].instance!r}; expected {expected}."
         return _explain(_closest(error), [*path, *_closest(error).path])
     where = _where(path)
     known = ", ".join(error.schema.get("properties", ()))
@@ -104,7 +106,4 @@ def _closest(error):
 
 def _where(path):
     """``objects[1].plane`` of a path of keys and indices."""
-    text = ""
-    for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text or "the scene"
+    return description.key_path(path) or "the scene"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from btfpipe.description import read_description
 from btfpipe.directions import bonn81, from_angles, ubo2014
 from btfpipe.errors import InputError
 
@@ -28,17 +29,11 @@ def read_spec(path):
     InputError
         Names the key, what was found and what was expected.
     """
-    import yaml
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
 
     path = Path(path)
-    try:
-        spec = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}).") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({' '.join(str(error).split())}).") from error
+    spec = read_description(path, "a specification of a simulation")
     problem = best_match(Draft202012Validator(schema()).iter_errors(spec))
     if problem is not None:
         key = ".".join(str(k) for k in problem.absolute_path) or "the specification"

@@ -1,8 +1,8 @@
 """Strokes: a small YAML file that says where the sample's right-hand direction should point."""
 
-import math
 from pathlib import Path
 
+from btfpipe.description import read_description
 from btfpipe.errors import InputError
 
 _FORM = "strokes: [{point: [x, y, z], vector: [x, y, z]}, ...]"
@@ -16,16 +16,8 @@ def read_strokes(path):
     InputError
         For a file that is not YAML, an unknown or missing key (named), and anything but three finite numbers.
     """
-    import yaml
-
     path = Path(path)
-    try:
-        thing = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        said = " ".join(str(error).split())
-        raise InputError(f"{path}: not YAML ({said}). Expected {_FORM}.") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+    thing = read_description(path, "strokes", f" Expected {_FORM}.")
     _check_keys(path, "the file", thing, {"strokes"})
     strokes = thing["strokes"]
     if not isinstance(strokes, list) or not strokes:
@@ -40,7 +32,7 @@ def _stroke(path, i, stroke):
         if not (
             isinstance(numbers, list)
             and len(numbers) == 3
-            and all(type(x) in (int, float) and math.isfinite(x) for x in numbers)
+            and all(type(x) in (int, float) for x in numbers)
         ):
             raise InputError(f"{path}: stroke {i}: {key} is {numbers!r}; expected three numbers.")
     if not any(stroke["vector"]):

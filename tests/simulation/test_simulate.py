@@ -143,11 +143,17 @@ def test_bad_specification_is_refused_by_key_and_nothing_is_written(
 
 def test_specification_that_is_no_yaml_is_refused(btfpipe, tmp_path):
     path = tmp_path / "spec.yaml"
-    for text, words in (("texels: [1, ", "not YAML"), ("- a list", "not of type 'object'")):
+    for text, words in (
+        ("texels: [1, ", "not YAML"),
+        ("- a list", "not of type 'object'"),
+        ("", "empty; expected a specification"),
+        ("texels: 8\ntexels: 9", "the key 'texels' is given twice, in lines 1 and 2"),
+        ("texels: [8, .inf]", "texels[1] is inf; expected a finite number"),
+    ):
         path.write_text(text)
         assert words in btfpipe("simulate", path, "-o", tmp_path / "o.zip", code=3).stderr
     path.write_bytes(b"\xff\xfe\x00")
-    assert "cannot be read" in btfpipe("simulate", path, "-o", tmp_path / "o.zip", code=3).stderr
+    assert "binary file" in btfpipe("simulate", path, "-o", tmp_path / "o.zip", code=3).stderr
 
 
 @pytest.mark.parametrize(
