@@ -75,7 +75,9 @@ def test_strokes_and_turn_are_taken_from_the_command_line(shapes, btfpipe, tmp_p
         ("strokes: [{point: [1, 0, 0], vector: [0, 1, 0], weight: 3}]", "stroke 1 has the unknown key 'weight'"),
         ("strokes: [{point: [1, 0, 0]}]", "stroke 1 lacks vector"),
         ("strokes: [{point: [1, 0], vector: [0, 1, 0]}]", "stroke 1: point is [1, 0]; expected three numbers"),
-        ("strokes: [{point: [1, 0, .nan], vector: [0, 1, 0]}]", "expected three numbers"),
+        ("strokes: [{point: [1, 0, .nan], vector: [0, 1, 0]}]", "strokes[0].point[2] is nan; expected a finite number"),
+        ("strokes: []\nstrokes: []", "the key 'strokes' is given twice, in lines 1 and 2"),
+        ("", "empty; expected strokes. Expected strokes: [{point"),
         ("strokes: [{point: [1, 0, 0], vector: [0, 0, 0]}]", "vector has no length"),
         ("strokes: []", "not a list of at least one stroke"),
         ("stroke: 3", "unknown key 'stroke'"),
@@ -97,7 +99,7 @@ def test_too_few_vertices_for_the_mesh_exit_3(shapes, btfpipe, tmp_path):
     many = [vertices + np.array((3 * i, 0, 0)) for i in range(60)]
     faces = np.concatenate([faces + i * len(vertices) for i in range(60)])
     mesh = shapes.obj(tmp_path / "many.obj", np.concatenate(many), faces)
-    result = btfpipe("surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, code=3)
+    result = btfpipe("surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1, code=3)
     assert "100 vertices asked for" in result.stderr
     assert "60 components" in result.stderr
     assert not (tmp_path / "s.npz").exists()
