@@ -38,7 +38,7 @@ def _bindings(context, parameter, values):
     help="Store all layers as 32-bit floats; colours, alpha and normals are 16-bit otherwise.",
 )
 @stage()
-def render(scene, bindings, width, height, samples, full, out, seed, threads, quiet):
+def render(scene, bindings, width, height, samples, full, out, seed, threads, memory, quiet):
     """Make a picture of a scene: dressed surfaces under lights, as OpenEXR.
 
     SCENE is a YAML file with camera, film, lights and objects. Layers of the picture: colour and alpha (R G B A,
@@ -61,7 +61,9 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, qu
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
     film = {"width": width, "height": height, "samples": samples}
     start = time.perf_counter()
-    loaded = load_scene(scene, bindings, film=film, read_mesh=read_mesh)
+    loaded = load_scene(
+        scene, bindings, film=film, read_mesh=read_mesh, memory=memory, threads=threads
+    )
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:

@@ -8,6 +8,9 @@ from numba import njit
 from btfpipe.errors import InputError
 from btfpipe.synthesis.coherence import find_coherent
 
+_MOST_VERTICES = 20_000_000
+_MOST_ACROSS = 1 << 20  # texels; beyond, single precision leaves too little between them
+
 
 @dataclass
 class Dressing:
@@ -76,8 +79,9 @@ def dressed_surface(level, coordinates, appearance, interpolation, name=""):
     Raises
     ------
     InputError
-        If the map has another number of elements, or leaves the sample.
+        If the map has another number of elements, was made for a sample of another size, or leaves the sample.
     """
+    require_size(coordinates, appearance, name)
     vertices = np.ascontiguousarray(level.vertices, np.float64)
     if coordinates.row.shape[1] != len(vertices):
         raise InputError(
@@ -91,6 +95,17 @@ def dressed_surface(level, coordinates, appearance, interpolation, name=""):
         vertices, faces, normals, tangents, coordinates, appearance, interpolation, name
     )
     return Thing(vertices, faces, normals, dressing, solid=True)
+
+
+def require_size(coordinates, appearance, name):
+    """Refuse a map that was made for a sample of another size than this one's; of another material it may be."""
+    size = coordinates.about.get("sample_shape")
+    if size is not None and list(size) != list(appearance.shape):
+        raise InputError(
+            f"{name}: made for a sample of {' x '.join(map(str, size))} texels and the model has"
+            f" {' x '.join(map(str, appearance.shape))}; name the model of that sample, or run `btfpipe synthesize`"
+            " on this one."
+        )
 
 
 def dress(vertices, faces, normals, tangents, coordinates, appearance, interpolation, name=""):
@@ -152,7 +167,14 @@ def flat(plane, albedo):
 
 
 def patch(
-    plane, appearance, interpolation, *, coordinates=None, texels_per_unit=None, repeats=None
+    plane,
+    appearance,
+    interpolation,
+    *,
+    coordinates=None,
+    texels_per_unit=None,
+    repeats=None,
+    name="",
 ):
     """A rectangle that shows the sample itself, or a map over a plane.
 
@@ -161,7 +183,8 @@ def patch(
     Raises
     ------
     InputError
-        If more than the whole is asked of something that does not repeat.
+        If more than the whole is asked of something that does not repeat, more texels than there is memory or
+        precision for, or the map was made for a sample of another size.
     """
     from btfpipe.synthesis.coordinate_map import CoordinateMap
 
@@ -170,6 +193,7 @@ def patch(
         rows, cols = appearance.shape
         toroidal = appearance.toroidal
     else:
+        require_size(coordinates, appearance, name)
         rows, cols = coordinates.domain["plane"]
         toroidal = coordinates.domain.get("toroidal", False)
     if texels_per_unit is None:
@@ -181,6 +205,17 @@ def patch(
         raise InputError(
             f"plane: {across:.1f} x {down:.1f} texels across and down, and there are {cols} x {rows} that do"
             " not repeat; lower texels_per_unit or repeats, or change the size."
+        )
+    if max(across, down) > _MOST_ACROSS:
+        raise InputError(
+            f"plane: {across:.4g} x {down:.4g} texels across and down; expected at most {_MOST_ACROSS}. Lower"
+            " texels_per_unit or repeats, or the size."
+        )
+    if coordinates is not None and (across + 2) * (down + 2) > _MOST_VERTICES:
+        raise InputError(
+            f"plane: {across:.4g} x {down:.4g} texels of a map, which need {(across + 2) * (down + 2):.4g}"
+            f" vertices; expected at most {_MOST_VERTICES // 10**6} million. Lower texels_per_unit or repeats,"
+            " or the size."
         )
     if coordinates is None:
         x, y = np.array([0, across]), np.array([0, down])
@@ -283,9 +318,9 @@ def winding_number(vertices, faces, x, y, z):
 
 def diffuse_mesh(path, albedo, read_mesh):
     """A diffuse object from a Surface file or, through `read_mesh`, from a foreign mesh."""
-    import zipfile
-
-    if zipfile.is_zipfile(path):
+    with open(path, "rb") as file:
+        ours = file.read(2) == b"PK"
+    if ours:
         from btfpipe.surface import Surface
 
         level = Surface.open(path).levels[0]

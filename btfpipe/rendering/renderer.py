@@ -11,6 +11,17 @@ LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col"
 _RAYS = (
     1 << 16
 )  # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
+_RAY_BYTES = 600  # origin, direction, hit, point, light, look-ups
+
+
+def tile_side(samples):
+    """Pixels along a tile's side at this many rays a pixel."""
+    return min(max(int(np.sqrt(_RAYS / samples)), 8), 256)
+
+
+def tile_bytes(samples):
+    """Most bytes that a thread holds for the rays of one tile, over surfaces of one layer."""
+    return tile_side(samples) ** 2 * samples * _RAY_BYTES
 
 
 class Renderer:
@@ -50,7 +61,7 @@ class Renderer:
     def tiles(self):
         """Rectangles (x, y, width, height) that cover the film."""
         film = self.scene.film
-        side = min(max(int(np.sqrt(_RAYS / film.samples)), 8), 256)
+        side = tile_side(film.samples)
         return [
             (x, y, min(side, film.width - x), min(side, film.height - y))
             for y in range(0, film.height, side)

@@ -1,5 +1,6 @@
 """The Scene: camera, film, lights and objects, loaded and checked against each other."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ from btfpipe.errors import InputError
 from btfpipe.rendering import objects
 from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
 from btfpipe.rendering.description import read_description
+from btfpipe.rendering.renderer import tile_bytes
+from btfpipe.sample import Sample
 
 
 @dataclass
@@ -59,7 +62,7 @@ class Scene:
     files: list | None = None
 
 
-def load_scene(path, bindings=None, *, film=None, read_mesh=None):
+def load_scene(path, bindings=None, *, film=None, read_mesh=None, memory=None, threads=1):
     """Load a scene's description and all files that it names.
 
     Parameters
@@ -72,6 +75,10 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None):
         Replaces entries of its film.
     read_mesh : callable, optional
         Path to (vertices, faces) of a foreign mesh file.
+    memory : int, optional
+        Bytes that the copies of Samples to shade from, and the tiles in work, may take.
+    threads : int
+        That will render; each works on a tile.
 
     Returns
     -------
@@ -80,7 +87,8 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None):
     Raises
     ------
     InputError
-        As `read_description`; if files do not belong together; if the camera is inside an object.
+        As `read_description`; if files do not belong together; if Samples take more than `memory`; if the camera is
+        inside an object.
     """
     description = read_description(path, bindings)
     settings = description.get("film", {}) | {k: v for k, v in (film or {}).items() if v}
@@ -90,13 +98,14 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None):
     try:
         lights = [_light(i, light) for i, light in enumerate(description["lights"])]
         opened, things, grounds, files = {}, [], [], []
+        room = None if memory is None else (memory, threads * tile_bytes(film.samples))
         for number, entry in enumerate(description["objects"]):
             files += [entry[key] for key in ("surface", "map", "model", "mesh") if key in entry]
             if "ground" in entry:
                 grounds.append(entry)
                 continue
             try:
-                thing = _thing(entry, opened, read_mesh)
+                thing = _thing(entry, opened, read_mesh, room)
                 things.append(objects.transformed(thing, entry.get("transform")))
             except InputError as error:
                 raise InputError(f"objects[{number}]: {error}") from error
@@ -133,7 +142,24 @@ def _light(number, light):
     return Light(True, direction / length, np.array(light["irradiance"], float))
 
 
-def _thing(entry, opened, read_mesh):
+def _require_room(path, opened, room):
+    """Refuse the Samples opened so far if the copies that shading keeps of them exceed the memory."""
+    samples = sum(s.codes.nbytes for s in opened.values() if isinstance(s, Sample))
+    memory, tiles = room
+    if samples and samples + tiles > memory:
+        raise InputError(
+            f"{path}: shading from a sample keeps a copy of it in memory; with the tiles in work that makes"
+            f" {_size(samples + tiles)} of the {_size(memory)} that --memory allows. Pass --memory"
+            f" {math.ceil((samples + tiles) / 2**30)}G, or a Model in its place: `btfpipe compress` makes one that"
+            " takes far less."
+        )
+
+
+def _size(count):
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
+
+
+def _thing(entry, opened, read_mesh, room):
     """Load one object; Models, Surfaces and their shaders are opened once."""
     from btfpipe.surface import Surface
     from btfpipe.synthesis import CoordinateMap
@@ -142,6 +168,8 @@ def _thing(entry, opened, read_mesh):
         key = (opener, file)
         if key not in opened:
             opened[key] = opener(file)
+            if room is not None:
+                _require_room(file, opened, room)
         return opened[key]
 
     interpolation = entry.get("interpolation", "barycentric")
@@ -173,6 +201,7 @@ def _thing(entry, opened, read_mesh):
             coordinates=coordinates,
             texels_per_unit=entry.get("texels_per_unit"),
             repeats=entry.get("repeats"),
+            name=entry.get("map", ""),
         )
     if "plane" in entry:
         return objects.flat(entry["plane"], entry["albedo"])

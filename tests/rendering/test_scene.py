@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from btfpipe.description import read_description
 from btfpipe.errors import InputError
 from btfpipe.rendering.scene import load_scene
 from btfpipe.synthesis import CoordinateMap
@@ -49,6 +50,16 @@ LIGHT = {"type": "directional", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
             {"camera": {"type": "perspective", "direction": [0, 0, 1], "height": 2}},
             "height does not belong",
         ),
+        ({"lights": [LIGHT | {"type": "spot"}]}, "'spot'; expected 'directional' or 'point'"),
+        ({"background": [0, float("nan"), 0]}, "background[1] is nan; expected a finite number"),
+        (
+            {"lights": [LIGHT | {"irradiance": [1, 1, float("inf")]}]},
+            "lights[0].irradiance[2] is inf; expected a finite number",
+        ),
+        (
+            {"objects": [GREY | {"plane": PLANE | {"size": [10**400, 1]}}]},
+            "objects[0].plane.size[0] is a number of 1329 bits",
+        ),
     ],
 )
 def test_unusable_scene_is_refused_by_key(changes, message, scene_file, btfpipe, tmp_path):
@@ -57,6 +68,39 @@ def test_unusable_scene_is_refused_by_key(changes, message, scene_file, btfpipe,
     assert message in done.stderr
     assert str(path) in done.stderr
     assert not (tmp_path / "p.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty; expected a scene"),
+        (b"# nothing but this\n", "empty; expected a scene"),
+        (b"PK\x03\x04\xff\xfe\x00", "not a scene (YAML) but a binary file"),
+        (b"a: 1\x00", "not a scene (YAML) but a binary file"),
+        (b"lights: [1,", "not YAML (while parsing"),
+        (b"film: 2026-99-99", "not YAML (month must be"),
+        (b"film:\n  width: 1\n  width: 2\n", "'width' is given twice, in lines 2 and 3"),
+        (b"{film: 1, 'film': 2}", "'film' is given twice, in lines 1 and 1"),
+        (b"film: &a [*a]", "or one in itself"),
+        (b"[" * 3000, "lists in lists beyond measure"),
+    ],
+)
+def test_file_that_is_no_description_is_refused(content, message, btfpipe, tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(content)
+    done = btfpipe("render", path, "-o", tmp_path / "p.exr", code=3)
+    assert message in done.stderr
+    assert str(path) in done.stderr
+
+
+def test_merged_keys_are_not_taken_for_keys_given_twice(tmp_path):
+    path = tmp_path / "merged.yaml"
+    path.write_text(
+        "base: &base {a: 1, b: 2}\nmore: &more {<<: *base, b: 3}\nlast: {<<: *more, a: 4}\n"
+    )
+    found = read_description(path, "a test")
+    assert found["more"] == {"a": 1, "b": 3}
+    assert found["last"] == {"a": 4, "b": 3}
 
 
 def test_camera_inside_an_object_is_refused(sphere, lambertian, scene_file, tmp_path):
@@ -105,6 +149,83 @@ def test_map_that_leaves_the_sample_is_refused(sphere, make_sample, scene_file, 
     entry = sphere(lambda lat, lon: (0 * lat + 20, 0 * lat), rings=12, segments=24)
     with pytest.raises(InputError, match=r"row runs from 20\.0 to 20\.0 and the model has 8"):
         load_scene(scene_file([entry]))
+
+
+def test_map_made_for_another_size_of_sample_is_refused(sphere, make_sample, scene_file, tmp_path):
+    make_sample(rows=16, cols=20, seed=1, toroidal=True).save(tmp_path / "m.sample.npz")
+    entry = sphere(rings=12, segments=24)
+    on_plane = {"plane": PLANE, "model": "m.sample.npz", "map": "plane.map.npz"}
+    zero = np.zeros(6, np.float32)
+    for about, fits in (
+        ({}, True),
+        ({"sample_shape": [16, 20]}, True),
+        ({"sample_shape": [20, 16]}, False),
+    ):
+        made = CoordinateMap.open(tmp_path / "sphere.map.npz")
+        made.about |= about
+        made.save(tmp_path / "sphere.map.npz")
+        flat = CoordinateMap(
+            zero, zero, zero, 1.0, {"plane": [2, 3], "toroidal": True}, about=about
+        )
+        flat.save(tmp_path / "plane.map.npz")
+        for thing, name in ((entry, "sphere.map.npz"), (on_plane, "plane.map.npz")):
+            path = scene_file([thing])
+            if fits:
+                assert load_scene(path).objects
+                continue
+            with pytest.raises(
+                InputError, match=rf"{name}: made for a sample of 20 x 16 texels .* has 16 x 20"
+            ):
+                load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"repeats": 1000000000, "map": "plane.map.npz"},
+            r"3e\+09 x 3e\+09 texels across and down",
+        ),
+        (
+            {"repeats": 2000, "map": "plane.map.npz"},
+            r"3.602e\+07 vertices; expected at most 20 million",
+        ),
+        ({"texels_per_unit": 1e300}, "expected at most 1048576. Lower texels_per_unit or repeats"),
+    ],
+)
+def test_more_texels_than_can_be_held_are_refused(
+    changes, message, make_sample, scene_file, tmp_path
+):
+    make_sample(toroidal=True).save(tmp_path / "m.sample.npz")
+    zero = np.zeros(6, np.float32)
+    domain = {"plane": [2, 3], "toroidal": True}
+    CoordinateMap(zero, zero, zero, 1.0, domain).save(tmp_path / "plane.map.npz")
+    with pytest.raises(InputError, match=message):
+        load_scene(scene_file([{"plane": PLANE, "model": "m.sample.npz"} | changes]))
+
+
+def test_sample_whose_copy_exceeds_the_memory_is_refused_and_its_model_is_not(
+    make_sample, scene_file, btfpipe, tmp_path
+):
+    from btfpipe.compression.svd import compress_svd
+
+    sample = make_sample(rows=64, cols=64)  # 7 views x 19 lights x 4096 texels x 12 bytes: 6.2 MiB
+    sample.save(tmp_path / "m.sample.npz")
+    compress_svd(sample, 4).save(tmp_path / "m.model.npz")
+    path = scene_file([{"plane": PLANE, "model": "$model"}])
+    command = ["render", path, "-o", tmp_path / "p.exr", "--force", "--threads", 1]
+    tiles = 256 * 256 * 600 / 2**20  # 37.5 MiB
+    for memory, model, code in (
+        (tiles + 6, "m.sample.npz", 3),
+        (tiles + 7, "m.sample.npz", 0),
+        (tiles + 6, "m.model.npz", 0),
+    ):
+        done = btfpipe(
+            *command, "--memory", f"{memory}M", "--bind", f"model={tmp_path / model}", code=code
+        )
+        if code:
+            assert "makes 44 MiB of the 44 MiB that --memory allows" in done.stderr
+            assert "`btfpipe compress`" in done.stderr
 
 
 def test_binding_that_no_placeholder_asks_for_is_refused(scene_file):
