@@ -4,7 +4,16 @@ import html
 import json
 from pathlib import Path
 
-HEAD = ["material", "what", "against", "between directions", "PSNR dB", "relative error", "SSIM"]
+HEAD = [
+    "material",
+    "what",
+    "against",
+    "between directions",
+    "PSNR linear, dB",
+    "PSNR display, dB",
+    "relative error",
+    "SSIM",
+]
 
 
 def rows_of(report, material, what, against):
@@ -15,7 +24,8 @@ def rows_of(report, material, what, against):
             material,
             what,
             against,
-            name,
+            name.replace("own_pairs", "none: its own pairs"),
+            f"{linear['psnr_db']:.1f}",
             f"{display['psnr_db']:.1f}",
             f"{100 * linear['relative_error']:.2f} %",
             f"{display['ssim']:.4f}",
