@@ -1,11 +1,18 @@
 """``btfpipe preview``: pictures for people."""
 
+import math
 from pathlib import Path
 
 import click
 
 from btfpipe.cli.options import input_file, stage
 from btfpipe.errors import InputError
+
+
+def _not_nan(context, parameter, value):
+    if value is not None and math.isnan(value):  # which no range keeps out
+        raise click.BadParameter("nan is not a finite number.")
+    return value
 
 
 @click.command()
@@ -15,7 +22,8 @@ from btfpipe.errors import InputError
 )
 @click.option(
     "--exposure",
-    type=float,
+    type=click.FloatRange(-60, 60),
+    callback=_not_nan,
     metavar="EV",
     show_default="automatic",
     help="Brighten by this many doublings, the same for all pictures.",

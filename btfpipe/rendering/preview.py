@@ -47,6 +47,7 @@ def tone_map(picture, exposure=1.0, filmic=False):
     """
     colour = np.maximum(np.asarray(picture[..., :3], np.float32) * np.float32(exposure), 0)
     if filmic:
+        colour = np.minimum(colour, 1e6)  # white long before, and its square is still a number
         colour = colour * (2.51 * colour + 0.03) / (colour * (2.43 * colour + 0.59) + 0.14)
     if picture.shape[2] > 3:
         behind = np.float32(((BACKDROP + 0.055) / 1.055) ** 2.4)
@@ -100,10 +101,21 @@ def show_layer(channels, layer, name):
 
 
 def read_channels(path):
-    """Channels of a rendered picture, name to (rows, cols) array."""
+    """Channels of a rendered picture, name to (rows, cols) array.
+
+    Raises
+    ------
+    InputError
+        If it is no picture, or holds display codes instead of radiance.
+    """
     from btfpipe.formats.images import open_picture
 
     picture = open_picture(path)
+    if picture.values.dtype.kind != "f":
+        raise InputError(
+            f"{path}: a picture of {picture.values.dtype} codes, made for display; expected a rendered .exr, whose"
+            " floating-point values are linear radiance."
+        )
     return {c: picture.values[..., i] for i, c in enumerate(picture.channels)}
 
 
@@ -119,7 +131,7 @@ def colour_of(channels, name):
 
 
 def sheet(pictures, columns=None, labels=None):
-    """Lay display pictures out in rows.
+    """Lay display pictures out in rows; cells are as wide as their labels need.
 
     Parameters
     ----------
@@ -128,14 +140,17 @@ def sheet(pictures, columns=None, labels=None):
     columns : int, optional
         As square a sheet as possible by default.
     labels : list of str, optional
-        Written under the pictures.
+        Written under the pictures, in as many lines as they have.
     """
     columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
     rows = math.ceil(len(pictures) / columns)
     height = max(p.shape[0] for p in pictures)
     width = max(p.shape[1] for p in pictures)
     scale = max(1, round(width / 400))
-    text = 12 * scale if labels else 0
+    text = 12 * scale * max(label.count("\n") + 1 for label in labels) if labels else 0
+    if labels:
+        lines = [line for label in labels for line in label.split("\n")]
+        width = max(width, *(_width(line, scale) for line in lines))
     gap = GAP if len(pictures) > 1 else 0
     out = np.full(
         (rows * (height + text + gap) - gap, columns * (width + gap) - gap, 3),
@@ -149,8 +164,18 @@ def sheet(pictures, columns=None, labels=None):
         out[y + top : y + top + picture.shape[0], x + left : x + left + picture.shape[1]] = picture
         if labels:
             strip = out[y + height : y + height + text, x : x + width]
-            strip[:] = _write(labels[number], strip, scale)
+            for line, words in enumerate(labels[number].split("\n")):
+                part = strip[12 * scale * line : 12 * scale * (line + 1)]
+                part[:] = _write(words, part, scale)
     return out
+
+
+def _width(label, scale):
+    """Pixels that a label takes, its margins with it; 0 without a font."""
+    import OpenImageIO as oiio
+
+    extent = oiio.ImageBufAlgo.text_size(label, 9 * scale)
+    return extent.width + 6 * scale if extent.defined else 0
 
 
 def _write(label, strip, scale):
@@ -197,7 +222,7 @@ def sample_sheet(appearance, lights=6, views=6):
                 np.degrees(to_angles(d))
                 for d in (appearance.light_directions[i], appearance.view_directions[v])
             ]
-            labels.append("light {:.0f} {:.0f}  view {:.0f} {:.0f}".format(*np.concatenate(angles)))
+            labels.append("light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(*np.concatenate(angles)))
             if (v, i) in pair_of:
                 pictures.append(np.asarray(appearance.pictures([pair_of[v, i]])[0]))
             else:
@@ -214,6 +239,12 @@ def _spread(directions, count):
     return sorted(chosen)
 
 
+def _starts_like_ours(path):
+    """Whether a file is, or once was, a zip file, as ours are; a truncated one has lost the rest."""
+    with path.open("rb") as file:
+        return file.read(2) == b"PK"
+
+
 def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False):
     """Display picture (rows, cols, 3) uint8 of rendered pictures, or of one Sample or Model.
 
@@ -222,7 +253,7 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
     paths : list of path-like
     columns : int, optional
     exposure : float, optional
-        Stops (doublings); by default one exposure that suits the whole sheet.
+        Stops (doublings), -60 to 60; by default one exposure that suits the whole sheet.
     filmic : bool
     layer : str
         One of `LAYERS`.
@@ -240,10 +271,8 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
     InputError
         If a file is neither a picture nor a Sample or Model, or lacks the layer.
     """
-    import zipfile
-
     paths = [Path(p) for p in paths]
-    archives = [p for p in paths if zipfile.is_zipfile(p)]
+    archives = [p for p in paths if _starts_like_ours(p)]
     if archives:
         from btfpipe.compression import open_appearance
 

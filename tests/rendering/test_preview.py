@@ -105,12 +105,45 @@ def test_what_cannot_be_shown_is_refused(options, message, exr, btfpipe, tmp_pat
     assert not out.exists()
 
 
+def test_labels_are_whole_below_pictures_smaller_than_they(make_sample, btfpipe, tmp_path):
+    small, large = (np.zeros((16, width, 3), np.uint8) for width in (20, 200))
+    label = "light 60 120\nview 75 345"
+    narrow, wide = (sheet([picture], 1, [label])[16:] for picture in (small, large))
+    assert narrow.shape[1] < wide.shape[1]
+    # what is written below the wide picture is written below the narrow one, and nothing beside
+    np.testing.assert_array_equal(narrow, wide[:, : narrow.shape[1]])
+    assert (wide[:, narrow.shape[1] - 3 :] == wide[0, -1]).all()
+    assert all(line.max() > 100 for line in (narrow[:12], narrow[12:]))
+    make_sample().save(tmp_path / "s.npz")
+    btfpipe("preview", tmp_path / "s.npz", "-o", tmp_path / "p.png", "--labels")
+    assert read_picture(tmp_path / "p.png").shape[0] == 6 * (16 + 24 + GAP) - GAP
+
+
+@pytest.mark.parametrize("stops", ["nan", "inf", "61", "-61"])
+def test_exposure_that_is_none_is_wrong_usage(stops, exr, btfpipe, tmp_path):
+    done = btfpipe("preview", exr(), "-o", tmp_path / "p.png", "--exposure", stops, code=2)
+    assert "not a finite number" in done.stderr or "not in the range -60<=x<=60" in done.stderr
+
+
+@pytest.mark.parametrize("filmic", [False, True])
+def test_utmost_exposure_is_white(filmic):
+    assert (tone_map(np.full((2, 2, 3), 6e4), 2.0**60, filmic) == 255).all()
+
+
 def test_other_files_are_refused(exr, make_sample, btfpipe, tmp_path):
     (tmp_path / "x.exr").write_bytes(b"not a picture")
     assert (
         "x.exr" in btfpipe("preview", tmp_path / "x.exr", "-o", tmp_path / "p.png", code=3).stderr
     )
+    write_picture(tmp_path / "codes.png", np.full((4, 4, 3), 128, np.uint8))
+    codes = btfpipe("preview", tmp_path / "codes.png", "-o", tmp_path / "p.png", code=3)
+    assert "codes.png: a picture of uint8 codes" in codes.stderr
+    assert "expected a rendered .exr" in codes.stderr
     make_sample().save(tmp_path / "s.npz")
+    half = (tmp_path / "s.npz").read_bytes()[:1000]
+    (tmp_path / "half.npz").write_bytes(half)
+    damaged = btfpipe("preview", tmp_path / "half.npz", "-o", tmp_path / "p.png", code=3)
+    assert "half.npz: not a btfpipe file, or damaged" in damaged.stderr
     both = btfpipe("preview", tmp_path / "s.npz", exr(), "-o", tmp_path / "p.png", code=3)
     assert "give it alone" in both.stderr
     layer = btfpipe(
