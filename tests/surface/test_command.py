@@ -99,7 +99,9 @@ def test_too_few_vertices_for_the_mesh_exit_3(shapes, btfpipe, tmp_path):
     many = [vertices + np.array((3 * i, 0, 0)) for i in range(60)]
     faces = np.concatenate([faces + i * len(vertices) for i in range(60)])
     mesh = shapes.obj(tmp_path / "many.obj", np.concatenate(many), faces)
-    result = btfpipe("surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1, code=3)
+    result = btfpipe(
+        "surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1, code=3
+    )
     assert "100 vertices asked for" in result.stderr
     assert "60 components" in result.stderr
     assert not (tmp_path / "s.npz").exists()
@@ -164,7 +166,7 @@ def test_sample_meshes_are_remade_byte_for_byte(shapes, tmp_path):
     maker = shapes.make_meshes()
     maker.main(tmp_path)
     kept = Path(maker.__file__).parent / "meshes"
-    assert {p.name for p in kept.iterdir()} == {"knot.obj", "pebble.obj"}
+    assert {p.name for p in kept.iterdir()} == {"knot.obj", "knot-strokes.yaml", "pebble.obj"}
     for path in kept.iterdir():
         assert path.stat().st_size < 200_000
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
