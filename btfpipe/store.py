@@ -9,9 +9,13 @@ A file is written as ``NAME.part`` beside its target and moved into place when c
 """
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
+import math
+import os
+import stat
 import struct
 import zipfile
 from pathlib import Path
@@ -67,11 +71,56 @@ def _cannot_write(path, error):
     return f"{path}: cannot be written ({error.strerror}); choose another --out or make room there."
 
 
+def check_writable(path, folder=False):
+    """Find out before the work whether `whole` could write `path`.
+
+    Parameters
+    ----------
+    path : path-like
+    folder : bool
+        Whether a folder of that name would be replaced.
+
+    Raises
+    ------
+    InputError
+        With the sentence that `whole` would give after the work.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        if path.is_dir() and not folder:
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if folder and part.is_dir():
+            return  # left by a run that was killed; its writer removes it
+        part.open("wb").close()
+        part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(_cannot_write(path, error)) from error
+
+
 def write_json(path, thing):
     """Write `thing` as indented JSON, whole or not at all."""
     with whole(path, "w") as file:
-        json.dump(thing, file, indent=2, default=_plain)
-        file.write("\n")
+        put_json(file, thing)
+
+
+def put_json(file, thing):
+    """Write `thing` as indented JSON into an open text file."""
+    json.dump(jsonable(thing), file, indent=2, allow_nan=False)
+    file.write("\n")
+
+
+def jsonable(thing):
+    """`thing` as JSON can hold it: plain values throughout, null for NaN and infinity."""
+    if isinstance(thing, dict):
+        return {key: jsonable(value) for key, value in thing.items()}
+    if isinstance(thing, list | tuple):
+        return [jsonable(value) for value in thing]
+    if isinstance(thing, float):
+        return float(thing) if math.isfinite(thing) else None
+    if thing is None or isinstance(thing, str | int):
+        return thing
+    return jsonable(_plain(thing))
 
 
 def _plain(thing):
@@ -355,6 +404,48 @@ def _members_digest(infos):
     return digest.hexdigest()[:12]
 
 
+def walk(folder):
+    """Everything below a folder, by names relative to it with forward slashes.
+
+    Returns
+    -------
+    files : dict of str to int
+        Sizes in bytes of the regular files; links to files are followed.
+    folders : list of str
+    others : list of str
+        Links that lead nowhere, pipes and the like.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be listed, or a file vanishes meanwhile.
+    """
+
+    def fail(error):
+        raise error
+
+    folder = Path(folder)
+    files, folders, others = {}, [], []
+    try:
+        for where, below, names in os.walk(folder, onerror=fail):
+            here = Path(where).relative_to(folder)
+            folders += [(here / name).as_posix() for name in below]
+            for name in names:
+                place, short = Path(where) / name, (here / name).as_posix()
+                dangling = place.is_symlink() and not place.exists()
+                found = None if dangling else place.stat()
+                if found is not None and stat.S_ISREG(found.st_mode):
+                    files[short] = found.st_size
+                else:
+                    others.append(short)
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or folder}: cannot be read ({error.strerror}); the folder must be readable"
+            " throughout and stay as it is."
+        ) from error
+    return files, folders, others
+
+
 def digest(path):
     """Digest of any input, cheap for large ones (12 hex digits).
 
@@ -364,9 +455,9 @@ def digest(path):
     path = Path(path)
     if path.is_dir():
         digest = hashlib.sha256()
-        for file in sorted(p for p in path.rglob("*") if p.is_file()):
-            name = file.relative_to(path).as_posix()
-            digest.update(f"{name}\0{file.stat().st_size}\n".encode())
+        files = walk(path)[0]
+        for name in sorted(files, key=lambda name: name.split("/")):
+            digest.update(f"{name}\0{files[name]}\n".encode())
         return digest.hexdigest()[:12]
     try:
         with zipfile.ZipFile(path) as archive:

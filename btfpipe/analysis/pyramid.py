@@ -1,5 +1,7 @@
 """Image pyramids of feature images, and Features straight from a feature image."""
 
+import math
+
 import numpy as np
 
 from btfpipe.analysis.features import FeatureLevel, Features
@@ -88,12 +90,15 @@ def plain_features(
     Raises
     ------
     InputError
-        If the image is not (rows, cols, d), holds NaN or infinity, or is too small.
+        If the image is not (rows, cols, d), holds NaN or infinity, is too small, or its values are so large that
+        squared distances of neighbourhoods overflow single precision.
     """
-    image = np.asarray(image, np.float32)
+    image = np.asarray(image)
     if image.ndim != 3 or image.size == 0:
         raise InputError(f"feature image has shape {image.shape}; expected (rows, cols, features).")
     require_finite(image, "feature image")
+    _require_distances(image, neighbourhood**2 + coarse_neighbourhood**2)
+    image = image.astype(np.float32)
     check_pyramid(image.shape[:2], levels, neighbourhood, coarse_neighbourhood, "feature image")
     made = []
     for level in range(levels):
@@ -127,4 +132,15 @@ def require_finite(image, what):
         raise InputError(
             f"{what} holds {int(bad.sum())} NaN or infinite values, the first at row {row}, col {col};"
             " every texel needs finite features. Mend or crop the source."
+        )
+
+
+def _require_distances(image, texels):
+    """Refuse values whose squared distances, summed over so many texels, leave single precision."""
+    largest = max(abs(float(image.max())), abs(float(image.min())))
+    limit = math.sqrt(float(np.finfo(np.float32).max) / (4 * image.shape[2] * texels))
+    if largest > limit:
+        raise InputError(
+            f"feature image reaches {largest:.3g}; squared distances overflow single precision beyond"
+            f" {limit:.3g}. Scale the features down: only their ratios matter."
         )

@@ -1,5 +1,6 @@
 """`btfpipe compare`: how far a Model is from a Sample."""
 
+import contextlib
 from pathlib import Path
 
 import click
@@ -37,7 +38,7 @@ _DEFINITIONS = {
     type=click.Path(path_type=Path, dir_okay=False),
     help="Picture to write: errors over all pairs; the best, middle and worst picture.",
 )
-@stage(out="optional")
+@stage(out="optional", outputs=("picture",))
 def compare(model, sample, ways, picture, out, threads, quiet):
     """Measure how far MODEL (a Model or a Sample) is from SAMPLE, at all of SAMPLE's direction pairs.
 
@@ -54,10 +55,6 @@ def compare(model, sample, ways, picture, out, threads, quiet):
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
-    if picture is not None and picture.exists() and not click.get_current_context().params["force"]:
-        raise click.UsageError(f"{picture} exists; pass --force to replace it.")
-    if picture is not None and not picture.parent.is_dir():
-        raise click.UsageError(f"{picture.parent}: no such folder; make it first.")
     if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".tif"):
         raise click.UsageError(f"{picture}: not a picture's name; end it in .png.")
     reference = Sample.open(sample)
@@ -86,10 +83,18 @@ def compare(model, sample, ways, picture, out, threads, quiet):
         "ratio": raw / size,
     }
     overall = {name: result.overall() for name, result in results.items()}
-    if out is not None:
-        store.write_json(
-            out,
-            {
+    if picture is not None:
+        from btfpipe.formats.images import encode_picture
+        from btfpipe.metrics.sheet import error_sheet
+
+        first = next(iter(results))
+        pictures_of = comparison.model_pictures(
+            stand_in, reference, None if first == "own_pairs" else first
+        )
+        sheet = encode_picture(error_sheet(reference, results, pictures_of), picture.suffix.lower())
+    with contextlib.ExitStack() as files:  # both appear, or neither
+        if out is not None:
+            report = {
                 "model": {"file": model.name, "digest": store.digest(model)},
                 "sample": {"file": sample.name, "digest": store.digest(sample)},
                 **facts,
@@ -98,17 +103,10 @@ def compare(model, sample, ways, picture, out, threads, quiet):
                     name: overall[name] | {"per_pair": _per_pair(result, reference)}
                     for name, result in results.items()
                 },
-            },
-        )
-    if picture is not None:
-        from btfpipe.formats.images import write_picture
-        from btfpipe.metrics.sheet import error_sheet
-
-        first = next(iter(results))
-        pictures_of = comparison.model_pictures(
-            stand_in, reference, None if first == "own_pairs" else first
-        )
-        write_picture(picture, error_sheet(reference, results, pictures_of))
+            }
+            store.put_json(files.enter_context(store.whole(out, "w")), report)
+        if picture is not None:
+            files.enter_context(store.whole(picture)).write(sheet)
     for name, result in overall.items():
         linear, display = result["linear"], result["display"]
         if not quiet:

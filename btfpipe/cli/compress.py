@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, naming, progress, stage
 
 
 @click.command()
@@ -19,7 +19,7 @@ from btfpipe.cli.options import input_file, progress, stage
     type=click.IntRange(min=1),
     default=40,
     show_default=True,
-    help="Terms of the sum; at most the lesser of texels and three channels a pair.",
+    help="Terms of the sum; no more are made than the lesser of texels and three channels a pair.",
 )
 @click.option(
     "--precision",
@@ -51,7 +51,7 @@ def compress(samples, method, components, precision, iterations, out, seed, thre
     if len(samples) > 1:
         raise click.UsageError(f"method {method} takes one sample; {len(samples)} are given.")
     sample = Sample.open(samples[0])
-    with progress("compress: pictures read", quiet) as report:
+    with naming(samples[0]), progress("compress: pictures read", quiet) as report:
         model = compress_svd(
             sample,
             components,
@@ -72,9 +72,16 @@ def compress(samples, method, components, precision, iterations, out, seed, thre
     model.save(out)
     size = out.stat().st_size
     warnings = []
-    if model.n_terms < components:
+    texels = sample.shape[0] * sample.shape[1]
+    most = min(texels, 3 * sample.n_pairs)
+    if components > most:
         warnings.append(
-            f"the sample's rank is {model.n_terms}: {components - model.n_terms} terms left out"
+            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
+            f" {components - most} terms left out"
+        )
+    if model.n_terms < min(components, most):
+        warnings.append(
+            f"the sample's rank is {model.n_terms}: {min(components, most) - model.n_terms} terms left out"
         )
     if not quiet:
         for warning in warnings:

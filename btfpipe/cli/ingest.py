@@ -6,8 +6,10 @@ from pathlib import Path
 import click
 
 from btfpipe import store
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
 from btfpipe.errors import InputError
+
+MOST_TEXELS = 16384  # a side
 
 
 class Size(click.ParamType):
@@ -19,10 +21,13 @@ class Size(click.ParamType):
         found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", value) if isinstance(value, str) else None
         if not found:
             self.fail(f"{value!r} is not a size; write ROWSxCOLS, such as 128x128.", param, ctx)
-        return int(found[1]), int(found[2])
+        size = tuple(int(side[:9]) for side in found.groups())
+        if max(size) > MOST_TEXELS:
+            self.fail(f"{value!r} is too large; at most {MOST_TEXELS} a side.", param, ctx)
+        return size
 
 
-_POSITIVE = click.FloatRange(min=0, min_open=True)
+_POSITIVE = FiniteFloat(min=0, min_open=True)
 
 
 @click.command()
@@ -65,7 +70,7 @@ _POSITIVE = click.FloatRange(min=0, min_open=True)
 )
 @click.option(
     "--grey-card-reflectance",
-    type=click.FloatRange(0, 1, min_open=True),
+    type=FiniteFloat(0, 1, min_open=True),
     help="Reflectance of the grey card, 0 to 1.",
 )
 @click.option("--flatten", is_flag=True, help="Remove slow drift of brightness over the patch.")

@@ -7,6 +7,8 @@ Exit codes: 0 done, 1 unforeseen (with traceback), 2 wrong usage or configuratio
 import contextlib
 import functools
 import json
+import math
+import os
 import re
 import resource
 import sys
@@ -16,7 +18,7 @@ from pathlib import Path
 import click
 
 from btfpipe import __version__, store
-from btfpipe.errors import BtfError
+from btfpipe.errors import BtfError, InputError
 from btfpipe.parallel import available_threads
 
 
@@ -31,14 +33,32 @@ class Memory(click.ParamType):
         found = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT]?)B?", str(value).strip().upper())
         if not found:
             self.fail(f"{value!r} is not an amount of memory; write 512M or 2G.", param, ctx)
-        return int(float(found[1]) * 1024 ** " KMGT".index(found[2] or " "))
+        amount = float(found[1]) * 1024 ** " KMGT".index(found[2] or " ")
+        if amount > 2**60:
+            self.fail(f"{value!r} is more memory than any machine has.", param, ctx)
+        return int(amount)
+
+
+class FiniteFloat(click.FloatRange):
+    """A number, neither NaN nor infinite, perhaps within bounds."""
+
+    name = "float"
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+    def _describe_range(self):
+        return "" if self.min is None and self.max is None else super()._describe_range()
 
 
 def _common(out):
     """The options that mean the same everywhere."""
     options = [
         click.option("-f", "--force", is_flag=True, help="Replace the output if it exists."),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
+        click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
                      help="Seed of everything random; the same seed gives the same bytes."),
         click.option("-t", "--threads", type=click.IntRange(min=1), default=available_threads,
                      show_default="all processors", help="Threads; never changes the result."),
@@ -56,7 +76,7 @@ def _common(out):
     return options
 
 
-def stage(out="required"):
+def stage(out="required", *, outputs=(), folder=False):
     """Give a command the common options, its summary and its exit codes.
 
     The command gets only those common options that its signature names. It returns a dict, the part of the
@@ -67,6 +87,11 @@ def stage(out="required"):
     ----------
     out : str or None
         ``"required"``, ``"optional"``, or None for a command that writes no file.
+    outputs : tuple of str
+        Names of the command's own options that name further files to write. All are checked before the work:
+        none may be there without --force, be an input too, or lie where nothing can be written.
+    folder : bool
+        Whether the command replaces folders, too.
     """
 
     def decorate(command):
@@ -74,10 +99,8 @@ def stage(out="required"):
 
         @functools.wraps(command)
         def run(force, seed, threads, memory, as_json, quiet, out=None, **kwargs):
-            if out is not None and Path(out).exists() and not force:
-                raise click.UsageError(f"{out} exists; pass --force to replace it.")
-            if out is not None and not Path(out).parent.is_dir():
-                raise click.UsageError(f"{Path(out).parent}: no such folder; make it first.")
+            targets = [Path(p) for p in (out, *map(kwargs.get, outputs)) if p is not None]
+            _check_targets(targets, _paths(kwargs, outputs), force)
             common = {
                 "out": out, "seed": seed, "threads": threads, "memory": memory, "quiet": quiet,
                 "as_json": as_json,
@@ -85,12 +108,21 @@ def stage(out="required"):
             _limit_numba(threads)
             start = time.perf_counter()
             try:
+                for target in targets:
+                    store.check_writable(target, folder)
                 facts = command(**{k: v for k, v in common.items() if k in takes}, **kwargs)
                 inputs = [_input(path) for path in facts.pop("inputs", [])]
                 text = facts.pop("text", None)
             except BtfError as error:
                 click.echo(f"Error: {error}", err=True)
                 sys.exit(error.exit_code)
+            except MemoryError:
+                click.echo(
+                    f"Error: {command.__name__} needs more memory than there is; ask for less (smaller"
+                    " pictures, fewer vertices) or lower --memory.",
+                    err=True,
+                )
+                sys.exit(InputError.exit_code)
             summary = {"stage": command.__name__, "btfpipe": __version__, "inputs": inputs}
             if out is not None:
                 summary["out"] = str(out)
@@ -103,7 +135,7 @@ def stage(out="required"):
                 "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
             }
             if as_json:
-                click.echo(json.dumps(summary, default=store._plain))
+                click.echo(json.dumps(store.jsonable(summary), allow_nan=False))
             elif text is not None:
                 click.echo(text)
             elif not quiet:
@@ -116,10 +148,31 @@ def stage(out="required"):
     return decorate
 
 
+def _paths(kwargs, outputs):
+    """The inputs among a command's own arguments: every path, alone or in a tuple, that is no output."""
+    for name, value in kwargs.items():
+        if name not in outputs:
+            for one in value if isinstance(value, tuple) else (value,):
+                if isinstance(one, Path):
+                    yield one
+
+
+def _check_targets(targets, inputs, force):
+    """Refuse outputs that are in the way of themselves, of inputs, or of what is there."""
+    inputs = {path.resolve() for path in inputs}
+    for i, target in enumerate(targets):
+        if target.resolve() in inputs:
+            raise click.UsageError(f"{target} is also the input; choose another name to write.")
+        if target.resolve() in {other.resolve() for other in targets[:i]}:
+            raise click.UsageError(f"{target} is to be written twice; choose two names.")
+        if os.path.exists(target) and not force:
+            raise click.UsageError(f"{target} exists; pass --force to replace it.")
+        if not os.path.isdir(target.parent):
+            raise click.UsageError(f"{target.parent}: no such folder; make it first.")
+
+
 def _limit_numba(threads):
     """Numba reads its thread limit when first imported: say it before any command imports it."""
-    import os
-
     os.environ.setdefault("NUMBA_NUM_THREADS", str(available_threads()))
     if "numba" in sys.modules:
         import numba
@@ -177,3 +230,14 @@ def progress(label, quiet=False):
 def input_file(**kwargs):
     """Type of a command's input argument: any existing path."""
     return click.Path(exists=True, path_type=Path, **kwargs)
+
+
+@contextlib.contextmanager
+def naming(path):
+    """Put a file's name in front of what goes wrong in the block, unless the message has it."""
+    try:
+        yield
+    except BtfError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}") from error

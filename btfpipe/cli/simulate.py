@@ -33,7 +33,7 @@ _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
     show_default=True,
     help="Of JPEG, in per cent.",
 )
-@stage()
+@stage(folder=True)
 def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, quality):
     """Ray-trace the meso-structure of SPEC (YAML) into a measurement.
 

@@ -4,14 +4,14 @@ import math
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
 
 
 @click.command()
 @click.argument("mesh", type=input_file(dir_okay=False))
 @click.option(
     "--vertices",
-    type=click.IntRange(min=100),
+    type=click.IntRange(100, 20_000_000),
     default=250_000,
     show_default=True,
     help="Vertices to resample to, met within 5 %.",
@@ -30,14 +30,14 @@ from btfpipe.cli.options import input_file, progress, stage
 )
 @click.option(
     "--turn-deg",
-    type=float,
+    type=FiniteFloat(),
     default=0.0,
     show_default=True,
     help="Turn the whole field counter-clockwise, degrees.",
 )
 @click.option(
     "--crease-deg",
-    type=click.FloatRange(0, 180),
+    type=FiniteFloat(0, 180),
     default=None,
     help="Keep edges sharp where faces meet at more than this angle between their normals, degrees."
     "  [default: all edges are smooth]",
@@ -49,7 +49,9 @@ from btfpipe.cli.options import input_file, progress, stage
     help="Round coarse facets off (Phong tessellation), or stay on the faces of the input.",
 )
 @stage()
-def surface(mesh, vertices, levels, field, turn_deg, crease_deg, smooth, out, threads, quiet):
+def surface(
+    mesh, vertices, levels, field, turn_deg, crease_deg, smooth, out, threads, memory, quiet
+):
     """Prepare a mesh for synthesis: clean it, resample it evenly, lay a vector field over it.
 
     MESH is an OBJ, PLY, OFF or STL file. Normals stored in it are not used: shading normals are
@@ -76,6 +78,7 @@ def surface(mesh, vertices, levels, field, turn_deg, crease_deg, smooth, out, th
             smooth=smooth,
             turn=math.radians(turn_deg),
             threads=threads,
+            memory=memory,
             name=str(mesh),
             report=lambda done, total: report(round(100 * done / total), 100),
         )

@@ -4,7 +4,9 @@ import math
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import FiniteFloat, input_file, naming, progress, stage
+
+_MOST_TEXELS = 16384  # a side
 
 
 class _Plane(click.ParamType):
@@ -16,9 +18,14 @@ class _Plane(click.ParamType):
         if isinstance(value, tuple):
             return value
         sides = value.lower().split("x")
-        if len(sides) != 2 or not all(s.isdigit() and int(s) for s in sides):
+        if len(sides) != 2 or not all(
+            s.isdecimal() and 0 < int(s[:9]) <= _MOST_TEXELS for s in sides
+        ):
             self.fail(
-                f"{value!r} is not a plane; write 256x384 for 256 rows and 384 cols.", param, ctx
+                f"{value!r} is not a plane; write 256x384 for 256 rows and 384 cols, at most {_MOST_TEXELS}"
+                " a side.",
+                param,
+                ctx,
             )
         return tuple(int(s) for s in sides)
 
@@ -55,24 +62,24 @@ class _Plane(click.ParamType):
 )
 @click.option(
     "--texels-per-unit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteFloat(min=0, min_open=True),
     help="Scale of the sample, texels per unit of length of the surface. [default: one texel per mean edge]",
 )
 @click.option(
     "--repeats",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteFloat(min=0, min_open=True),
     help="Scale of the sample, as its widths across the longest side of the surface's bounding box.",
 )
 @click.option(
     "--turn-deg",
-    type=float,
+    type=FiniteFloat(),
     default=0.0,
     show_default=True,
     help="Angle of the sample's right-hand axis from the vector field, counter-clockwise, degrees.",
 )
 @click.option(
     "--coherence",
-    type=click.FloatRange(min=0),
+    type=FiniteFloat(min=0),
     default=0.4,
     show_default=True,
     help="By how much nearer a texel must be that breaks a run; 0: not at all, as published.",
@@ -124,14 +131,16 @@ def synthesize(
         raise click.UsageError("--texels-per-unit, --repeats and --turn-deg are for surfaces.")
     full = search == "full"
     target = None if plane else Surface.open(surface)
-    sample = read_features(
-        features, None if full else k, levels, toroidal=toroidal, seed=seed, threads=threads, memory=memory
-    )  # fmt: skip
+    with naming(features):
+        sample = read_features(
+            features, None if full else k, levels, toroidal=toroidal, seed=seed, threads=threads, memory=memory
+        )  # fmt: skip
     common = {
         "full": full, "k": k, "levels": levels, "sweeps": sweeps, "coherence": coherence, "seed": seed,
         "distance": distance,
     }  # fmt: skip
-    with progress("synthesize", quiet) as report:
+    both = f"{features} on {surface or 'a plane'}"
+    with naming(both), progress("synthesize", quiet) as report:
         if plane:
             grown = grow_over_plane(sample, plane, on_progress=report, **common)
         else:

@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, naming, progress, stage
 
 
 @click.command()
@@ -69,7 +69,7 @@ def textons(
     from btfpipe.compression import open_appearance
 
     appearance = open_appearance(source)
-    with progress("textons", quiet) as report:
+    with naming(source), progress("textons", quiet) as report:
         features = texton_features(
             appearance,
             levels=levels,

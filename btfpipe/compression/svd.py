@@ -152,8 +152,8 @@ def compress_svd(
     sample : Appearance
         Read in blocks of pictures, about `iterations` + 2.4 times.
     n_terms : int
-        At most min(texels, 3 pairs). Terms whose singular value is rounding noise are left out, so that the
-        Model may have fewer.
+        At least 1. No more than min(texels, 3 pairs) exist, and terms whose singular value is rounding noise are
+        left out, so that the Model may have fewer.
     iterations : int, optional
         Power iterations over all pictures. By default they stop when the RMS error is estimated to be within
         0.5 % of the least possible, after 8 at the latest.
@@ -179,17 +179,15 @@ def compress_svd(
     Raises
     ------
     InputError
-        Too many terms, non-finite pictures, values beyond half precision, or too little memory.
+        No terms, non-finite pictures, values beyond half precision, or too little memory.
     """
     if precision not in ("half", "single"):
         raise InputError(f"precision {precision!r}; expected half or single.")
     texels = sample.shape[0] * sample.shape[1]
     most = min(texels, 3 * sample.n_pairs)
-    if not 1 <= n_terms <= most:
-        raise InputError(
-            f"{n_terms} terms of a sample of {texels} texels and {sample.n_pairs} pairs; expected 1 to {most},"
-            f" the lesser of texels and pairs times channels. Pass --components {most} or fewer."
-        )
+    if n_terms < 1:
+        raise InputError(f"{n_terms} terms asked for; expected at least 1.")
+    n_terms = min(n_terms, most)
     import scipy.linalg  # noqa: F401 (before its BLAS is limited to one thread)
 
     width = min(n_terms + _OVERSAMPLING, most)

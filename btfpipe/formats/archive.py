@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
+from btfpipe import store
 from btfpipe.errors import InputError
 
 COPY = re.compile(r" \(member \d+ of that name\)$")  # tells members of one name apart
@@ -47,15 +48,15 @@ def open_archive(path):
 
 
 class Folder:
-    """The files below a folder; names are relative, with forward slashes."""
+    """The files below a folder; names are relative, with forward slashes.
+
+    ``folders`` and ``others`` name what is no file: folders, and links that lead nowhere and the like.
+    """
 
     def __init__(self, path):
         self.path = Path(path)
-        self.names = sorted(
-            file.relative_to(self.path).as_posix()
-            for file in self.path.rglob("*")
-            if file.is_file()
-        )
+        files, self.folders, self.others = store.walk(self.path)
+        self.names = sorted(files)
 
     def __enter__(self):
         return self
@@ -77,6 +78,8 @@ class Folder:
 
 class Zip:
     """The members of a zip file."""
+
+    folders = others = ()
 
     def __init__(self, path):
         self.path = Path(path)

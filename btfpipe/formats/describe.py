@@ -38,8 +38,11 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
     try:
         picture = open_picture(path)
     except InputError as error:
-        with path.open("rb") as file:
-            head = file.read(16)
+        try:
+            with path.open("rb") as file:
+                head = file.read(16)
+        except OSError as unreadable:
+            raise InputError(f"{path}: cannot be read ({unreadable.strerror}).") from unreadable
         return {
             "kind": "unknown",
             "bytes": path.stat().st_size,

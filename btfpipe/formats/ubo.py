@@ -80,6 +80,12 @@ class Listing:
                     self.duplicates.append((pairs[view, light], name))
                 else:
                     pairs[view, light] = name
+        self.strays += archive.others
+        self.strays += [
+            name
+            for name in archive.folders
+            if name.lower().endswith(_ENDINGS) and parse_name(PurePosixPath(name).name) is not None
+        ]
         self.pairs = dict(sorted(pairs.items()))
         self.views = sorted({view for view, _ in pairs})
         self.lights = sorted({light for _, light in pairs})

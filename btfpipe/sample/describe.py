@@ -1,5 +1,7 @@
 """What a container of the project's is, and what is wrong with it, in plain values."""
 
+import math
+
 import numpy as np
 
 from btfpipe.directions import bonn81, to_angles, ubo2014
@@ -103,6 +105,10 @@ def describe_sample(sample, report=lambda done, total: None):
             f"{len(missing)} of {n_views * n_lights} view/light pairs are missing ({names}"
             f"{', ...' if len(missing) > _LISTED else ''})."
         )
+    for name in ("scale", "texels_per_mm"):
+        value = getattr(sample, name)
+        if value is not None and not (math.isfinite(value) and value > 0):
+            description["problems"].append(f"{name} is {value}; expected a positive number.")
     if len(pairs) > len(seen):
         description["problems"].append(f"{len(pairs) - len(seen)} pairs are there twice.")
     for name, table in (("view", sample.view_directions), ("light", sample.light_directions)):

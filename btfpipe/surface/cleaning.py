@@ -100,9 +100,14 @@ def _check_area(vertices, faces, name):
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     extent = np.ptp(vertices, axis=0).max(initial=0)
-    if not len(faces) or area.sum() <= 1e-9 * extent**2:
+    if not len(faces):
         raise InputError(
-            f"{name}: nothing is left after cleaning; {len(faces)} faces have an area."
+            f"{name}: nothing is left after cleaning; every face has two corners in one place."
+        )
+    if area.sum() <= 1e-9 * extent**2:
+        raise InputError(
+            f"{name}: nothing is left after cleaning but {len(faces)} faces without area, whose corners lie on"
+            " lines. Export the mesh again."
         )
 
 

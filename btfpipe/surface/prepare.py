@@ -16,6 +16,10 @@ from btfpipe.surface.topology import describe, edges
 
 _TOLERANCE = 0.05
 _FIELD_ROUNDS = 10
+_FEWEST = 20  # vertices of the coarsest level
+# measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
+_PROCESS_BYTES = 200 << 20
+_BYTES_A_VERTEX = 1500
 
 
 def prepare(
@@ -29,6 +33,7 @@ def prepare(
     smooth=True,
     turn=0.0,
     threads=1,
+    memory=None,
     name="mesh",
     report=lambda done, total: None,
 ):
@@ -52,6 +57,8 @@ def prepare(
         Turns the field counter-clockwise, radians.
     threads : int
         Never changes the result.
+    memory : int, optional
+        Bytes to stay within, by an estimate made before the work.
     name : str
         What messages call the mesh.
     report : callable
@@ -66,8 +73,12 @@ def prepare(
     Raises
     ------
     InputError
-        See `clean`; also if the finest level cannot have `n_vertices` within 5 %.
+        See `clean`; also if the finest level cannot have `n_vertices` within 5 %, if the coarsest would have
+        hardly any, or if `memory` does not suffice.
     """
+    _check_levels(name, n_vertices, n_levels)
+    if memory is not None:
+        _check_memory(name, n_vertices, memory)
     # libigl reads it at its first call
     os.environ.setdefault("IGL_NUM_THREADS", str(threads))
     vertices, faces, repairs = clean(vertices, faces, name)
@@ -119,6 +130,28 @@ def prepare(
         "closest_point_parents": fallbacks,
     }
     return Surface(levels, dict(facts)), facts
+
+
+def _check_levels(name, n_vertices, n_levels):
+    fitting = 1
+    while n_vertices // 4**fitting >= _FEWEST:
+        fitting += 1
+    if n_levels > fitting:
+        raise InputError(
+            f"{name}: {n_levels} levels of {n_vertices} vertices leave {n_vertices // 4 ** (n_levels - 1)} on the coarsest;"
+            f" expected at least {_FEWEST}. Ask for at most {fitting} with --levels, or for more vertices."
+        )
+
+
+def _check_memory(name, n_vertices, memory):
+    need = _PROCESS_BYTES + _BYTES_A_VERTEX * n_vertices
+    if need > memory:
+        fits = max(0, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
+        advice = f"ask for at most {fits} with --vertices" if fits >= 100 else "raise it"
+        raise InputError(
+            f"{name}: {n_vertices} vertices need about {need >> 20} MB; --memory allows {memory >> 20} MB:"
+            f" {advice}{', or raise it' if fits >= 100 else ''}."
+        )
 
 
 def _check_count(name, found, wanted, n_components):

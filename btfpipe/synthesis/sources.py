@@ -78,8 +78,10 @@ def _kind(path):
     import zipfile
 
     from btfpipe import store
+    from btfpipe.formats.archive import is_zip
 
-    return store.read(path).kind if zipfile.is_zipfile(path) else None
+    # a truncated zip is known by its first bytes only; its reader says what is wrong with it
+    return store.read(path).kind if zipfile.is_zipfile(path) or is_zip(path) else None
 
 
 def _appearance_image(path, seed, threads, memory):

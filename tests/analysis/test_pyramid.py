@@ -65,3 +65,20 @@ def test_sides_that_cannot_be_halved_are_refused_with_a_crop_that_can(rng):
 def test_an_even_neighbourhood_is_refused(rng):
     with pytest.raises(InputError, match="expected an odd number"):
         plain_features(rng.random((24, 24, 3)), neighbourhood=4)
+
+
+def test_values_up_to_the_limit_have_finite_distances_and_beyond_it_are_refused(rng):
+    image = np.where(rng.random((16, 16, 3)) < 0.5, -1.0, 1.0)
+    with pytest.raises(InputError, match=r"reaches 1e.25; squared distances overflow") as refused:
+        plain_features(image * 1e25)
+    limit = float(str(refused.value).split("beyond ")[1].split(". ")[0])
+    vectors = plain_features(image * 0.99 * limit, levels=2).levels[0].vectors
+    farthest = np.square(vectors.max(axis=0) - vectors.min(axis=0)).sum()
+    assert np.isfinite(np.float32(farthest * (5**2 + 3**2)))
+    with pytest.raises(InputError, match="overflow"):
+        plain_features(image * 1.01 * limit)
+
+
+def test_doubles_beyond_single_precision_are_too_large_and_not_infinite():
+    with pytest.raises(InputError, match=r"reaches 1e.300"):
+        plain_features(np.full((16, 16, 1), 1e300))

@@ -7,6 +7,7 @@ import pytest
 
 from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import bonn81
+from btfpipe.errors import InputError
 from btfpipe.formats.images import read_picture
 
 
@@ -111,3 +112,28 @@ def test_things_that_do_not_compare_are_refused_and_nothing_is_written(btfpipe, 
         )  # fmt: skip
         assert message in done.stderr
         assert not list(files.glob("r.json*")) + list(files.glob("e.png*"))
+
+
+def test_the_report_and_the_picture_appear_together_or_not_at_all(btfpipe, files, monkeypatch):
+    from btfpipe.formats import images
+
+    ask = ("compare", files / "m.npz", files / "s.npz", "-o", files / "r.json", "--picture")
+
+    def fail(*_, **__):
+        raise InputError("no room in the picture")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(images, "encode_picture", fail)
+        assert "no room" in btfpipe(*ask, files / "e.png", code=3).stderr
+    assert not list(files.glob("r.json*")) + list(files.glob("e.png*"))
+    btfpipe(*ask, files / "e.png")
+    assert (files / "r.json").exists()
+    assert (files / "e.png").exists()
+
+
+def test_the_picture_replaces_no_input(btfpipe, files, make_sample):
+    make_sample().save(files / "s.png")
+    done = btfpipe(
+        "compare", files / "m.npz", files / "s.png", "--picture", files / "s.png", "-f", code=2
+    )
+    assert "is also the input" in done.stderr

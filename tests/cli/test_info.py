@@ -1,4 +1,6 @@
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -217,3 +219,55 @@ def test_a_newer_file_is_refused(btfpipe, tmp_path, monkeypatch):
     store.write(tmp_path / "a.npz", "sample", {})
     monkeypatch.undo()
     assert "newer btfpipe" in btfpipe("info", tmp_path / "a.npz", code=3).stderr
+
+
+@pytest.mark.parametrize("scale", [np.nan, np.inf, 0.0, -1.0])
+def test_a_scale_that_is_no_positive_number_is_a_problem(info, make_sample, tmp_path, scale):
+    make_sample(scale=scale).save(tmp_path / "s.npz")
+    (problem,) = info(tmp_path / "s.npz")["problems"]
+    assert f"scale is {scale}; expected a positive number" in problem
+
+
+def test_what_is_no_file_in_a_folder_is_a_stray(info, make_measurement):
+    path, _ = make_measurement("folder")
+    (path / "tl000 pl000 tv075 pv000.png").symlink_to("gone")
+    (path / "tl000 pl000 tv075 pv090.png").mkdir()
+    (path / "deeper").mkdir()
+    said = info(path)
+    assert said["problems"] == []
+    assert said["pairs"] == 6
+    assert sorted(said["ignored"]) == ["tl000 pl000 tv075 pv000.png", "tl000 pl000 tv075 pv090.png"]
+
+
+def test_a_folder_that_cannot_be_listed_is_one_clear_sentence(
+    btfpipe, make_measurement, monkeypatch
+):
+    path, _ = make_measurement("folder")
+    (path / "closed").mkdir()
+    real = os.scandir
+
+    def scandir(where):
+        if str(where).endswith("closed"):
+            raise PermissionError(13, "Permission denied", str(where))
+        return real(where)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    done = btfpipe("info", path, code=3)
+    assert f"{path / 'closed'}: cannot be read (Permission denied)" in done.stderr
+
+
+def test_a_file_that_vanishes_while_a_folder_is_listed_is_named(
+    btfpipe, make_measurement, monkeypatch
+):
+    path, _ = make_measurement("folder")
+    real = Path.stat
+
+    def stat(self, **kwargs):
+        if self.name.startswith("00003"):
+            raise FileNotFoundError(2, "No such file or directory", str(self))
+        return real(self, **kwargs)
+
+    monkeypatch.setattr(Path, "stat", stat)
+    done = btfpipe("info", path, code=3)
+    assert "00003" in done.stderr
+    assert "cannot be read (No such file or directory)" in done.stderr

@@ -148,3 +148,27 @@ def test_an_array_of_text_is_refused(btfpipe, tmp_path):
 )
 def test_wrong_usage_exits_2(btfpipe, tmp_path, image, options):
     btfpipe("synthesize", image, *options, "-o", tmp_path / "c.map.npz", code=2)
+
+
+def test_a_truncated_file_of_our_own_is_called_damaged(btfpipe, tmp_path, make_sample):
+    make_sample().save(tmp_path / "s.sample.npz")
+    data = (tmp_path / "s.sample.npz").read_bytes()
+    (tmp_path / "s.sample.npz").write_bytes(data[: len(data) // 2])
+    result = btfpipe(
+        "synthesize",
+        tmp_path / "s.sample.npz",
+        "--plane",
+        "16x16",
+        "-o",
+        tmp_path / "c.npz",
+        code=3,
+    )
+    assert "s.sample.npz: not a btfpipe file, or damaged" in result.stderr
+
+
+def test_features_whose_distances_overflow_are_refused_by_name(btfpipe, tmp_path):
+    np.save(tmp_path / "large.npy", np.full((16, 16, 3), 1e30))
+    result = btfpipe(
+        "synthesize", tmp_path / "large.npy", "--plane", "16x16", "-o", tmp_path / "c.npz", code=3
+    )
+    assert "large.npy: feature image reaches 1e+30" in result.stderr
