@@ -45,7 +45,7 @@ def display(file_format, largest_value):
 def require_memory(patch, rays, memory):
     """Refuse, before work starts, a patch whose geometry and light paths exceed `memory` bytes.
 
-    The numbers are measured: about 150 bytes for a triangle in Embree, 28 for a ray that is kept (half of them), 100
+    Rough: about 150 bytes for a triangle in Embree, 28 for a ray that is kept (half of them), 100
     for a vertex.
     """
     needed = int(len(patch.faces) * copies(patch) * 150 + len(patch.normals) * (14 * rays + 100))
