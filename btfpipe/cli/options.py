@@ -173,7 +173,7 @@ def _check_targets(targets, inputs, force):
 
 def _limit_numba(threads):
     """Numba reads its thread limit when first imported: say it before any command imports it."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(available_threads()))
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     if "numba" in sys.modules:
         import numba
 
