@@ -172,12 +172,13 @@ def _check_targets(targets, inputs, force):
 
 
 def _limit_numba(threads):
-    """Numba reads its thread limit when first imported: say it before any command imports it."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    if "numba" in sys.modules:
-        import numba
+    """Bound numba's threads: before its first import by its environment, which it must not see change later."""
+    if "numba" not in sys.modules:
+        os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+        return
+    import numba
 
-        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
 
 def _input(path):
