@@ -109,6 +109,7 @@ def grow_over_surface(
         done = np.full(n, below is not None)
         times = np.zeros(n, np.int64), np.ones(n, np.int64), np.zeros(n, np.float32)
         tally = np.ones(5, np.int64)
+        room = search.scratch(sample, PATCH)
         jobs = _Jobs(
             _Flatten(level, mesh, coarse_mesh, sample, breadth_first(mesh, int(seed) % n)), memory
         )
@@ -119,7 +120,7 @@ def grow_over_surface(
                 tick = time.perf_counter()
                 search.grow(
                     *job, sample, full, below is None and sweep == 0,
-                    np.float32(0.0 if below is None else coherence * 2.0**-i), *state, done, *times, coarse_label, tally,
+                    np.float32(0.0 if below is None else coherence * 2.0**-i), *state, done, *times, coarse_label, room, tally,
                 )  # fmt: skip
                 searching += time.perf_counter() - tick
                 finished += len(job[0])

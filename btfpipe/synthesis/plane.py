@@ -7,8 +7,8 @@ picture with a border, and a row of a neighbourhood is one run of memory, in the
 import time
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import leaf
 from btfpipe.errors import InputError
 from btfpipe.hashing import uniform
 from btfpipe.synthesis.coordinate_map import CoordinateMap
@@ -17,13 +17,14 @@ from btfpipe.synthesis.growth import COHERENCE, SWEEPS, summary
 from btfpipe.synthesis.search import (
     CANDIDATES,
     FALLBACKS,
+    FAST,
     MOVED,
     STARTS,
     list_candidates,
+    scratch_lists,
     square_of_run,
 )
 
-_FAST = {"reassoc", "contract", "nsz"}
 _ROWS = 16  # rows between two reports of progress
 
 
@@ -79,14 +80,15 @@ def grow_over_plane(
         where = tuple(np.pad(a, half, "wrap") for a in np.divmod(texel, np.int32(sample.cols)))
         distances = np.zeros((rows, cols), np.float32)
         done = np.full(where[0].shape, below is not None)
+        scratch = _scratch(sample)
         for sweep in range(sweeps[0] if below is None else sweeps[1]):
             tally = np.zeros(5, np.int64)
             start = time.perf_counter()
             for first in range(0, rows, _ROWS):
                 last = min(first + _ROWS, rows)
                 grow_rows(
-                    first, last, where, canvas, coarse, done, distances, sample, full,
-                    np.float32(0.0 if below is None else coherence * 2.0**-i), tally,
+                    first, last, where, canvas, coarse, done, distances, sample, full, below is None and sweep == 0,
+                    np.float32(0.0 if below is None else coherence * 2.0**-i), scratch, tally,
                 )  # fmt: skip
                 finished += (last - first) * cols
                 if on_progress is not None:
@@ -118,7 +120,20 @@ def _canvas(tables, texel):
     return np.ascontiguousarray(labels).ravel(), image.ravel(), labels.shape[1]
 
 
-@njit(cache=True, nogil=True)
+def _scratch(sample):
+    """What `grow_rows` writes down about one texel: by texel of the sample, by place of the square, by candidate."""
+    texels, places = sample.rows * sample.cols, sample.fine.side**2
+    return (
+        np.full(texels, -1, np.int32),
+        np.empty(texels, np.int32),
+        np.empty((places, 2), np.int32),
+        np.empty(places, np.int32),
+        np.empty(places, np.float32),
+        scratch_lists(sample, places),
+    )
+
+
+@leaf
 def _scatter(sample, seed, texel):
     """A random texel everywhere."""
     low, high, left, right = sample.inside
@@ -130,7 +145,7 @@ def _scatter(sample, seed, texel):
             texel[r, c] = row * sample.cols + col
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _inherit(below, coarse_sample, sample, texel):
     """First pass: the texel of the coarser level, scaled up, and the place among its four children."""
     for r in range(texel.shape[0]):
@@ -141,11 +156,14 @@ def _inherit(below, coarse_sample, sample, texel):
             texel[r, c] = row * sample.cols + col
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
+@leaf(fastmath=FAST)
 def _square(
     ours, our_image, our_width, r, c, side, labels, table, image, width, n, depth, s, e, total, limit
 ):  # fmt: skip
-    """`total` plus the distance of the squares at (r, c) of the output and (s, e) of the sample, up to `limit`."""
+    """`total` plus the distance of the squares at (r, c) of the output and (s, e) of the sample.
+
+    Given up above `limit` after the second row: a test after every row is mispredicted more often than it saves.
+    """
     for i in range(side):
         run = (r + i) * our_width + c
         other = (s + i) * width + e
@@ -156,12 +174,12 @@ def _square(
                 ]
         else:
             total += square_of_run(our_image, run * depth, image, other * depth, side * depth)
-        if total >= limit:
+        if i == 1 and total >= limit:
             break
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
+@leaf(fastmath=FAST)
 def _places(
     ours, our_image, our_width, r, c, labels, table, image, width, n, depth, s, e, places, limit
 ):  # fmt: skip
@@ -179,7 +197,7 @@ def _places(
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@leaf(fastmath=FAST)
 def _choose(
     tries, penalty, count, r, c, places, cols, side, canvas, flat, coarse_side, coarse_canvas, coarse_flat
 ):  # fmt: skip
@@ -221,9 +239,9 @@ def _choose(
     return best, best_distance
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def grow_rows(
-    first, last, where, canvas, coarse_canvas, done, distances, sample, full, kappa, tally
+    first, last, where, canvas, coarse_canvas, done, distances, sample, full, skip, kappa, scratch, tally
 ):  # fmt: skip
     """Synthesise rows first to last in scanning order; the search is that of `search.grow`.
 
@@ -239,7 +257,11 @@ def grow_rows(
         Distance of the texel chosen.
     sample : Exemplar
     full : bool
+    skip : bool
+        Whether something is not `done` yet.
     kappa : float32
+    scratch
+        Of `_scratch`.
     tally : (5,) int64
     """
     side = sample.fine.side
@@ -247,21 +269,18 @@ def grow_rows(
     rows, cols = distances.shape
     width = cols + 2 * half
     row, col = where
-    flat_row, flat_col, flat_done = row.ravel(), col.ravel(), done.ravel()
+    flat_row, flat_col, flat_done = (
+        row.reshape(row.size),
+        col.reshape(row.size),
+        done.reshape(row.size),
+    )
     our_labels, our_image, _ = canvas
     labels, _, image, sample_width, _, depth = sample.fine.flat
     sample_rows, sample_cols = sample.rows, sample.cols
     toroidal = sample.toroidal
     lists, inside = sample.lists, sample.inside
-    compared = np.full(sample_rows * sample_cols, -1, np.int32)
-    slot = np.empty(sample_rows * sample_cols, np.int32)
-    places = np.empty((side * side, 2), np.int32)
-    owners = np.empty(side * side, np.int32)
-    support = np.empty(side * side, np.float32)
-    most = max(compared.shape[0], side * side * sample.lists.shape[1])
-    tries = np.empty(most, np.int32)
-    origin = np.empty(most, np.int32)
-    penalty = np.empty(most, np.float32)
+    compared, slot, places, owners, support, (tries, origin, penalty) = scratch
+    compared[:] = -1
     pair = (
         sample_cols, side, canvas, sample.fine.flat, sample.coarse.side, coarse_canvas, sample.coarse.flat,
     )  # fmt: skip
@@ -274,17 +293,20 @@ def grow_rows(
             for i in range(side):
                 for j in range(side):
                     place = np.uint64((r + i) * width + c + j)
-                    if not flat_done[place]:
-                        continue
-                    places[count, 0] = i
-                    places[count, 1] = j
+                    if skip:
+                        if not flat_done[place]:
+                            continue
+                        places[count, 0] = i
+                        places[count, 1] = j
                     count += 1
                     s = flat_row[place] + half - i
                     e = flat_col[place] + half - j
                     if toroidal:  # a sample has at least `side` texels: one period is enough
                         s += sample_rows if s < 0 else (-sample_rows if s >= sample_rows else 0)
                         e += sample_cols if e < 0 else (-sample_cols if e >= sample_cols else 0)
-                    elif s < 0 or s >= sample_rows or e < 0 or e >= sample_cols:
+                    elif np.uint64(s) >= np.uint64(sample_rows) or np.uint64(e) >= np.uint64(
+                        sample_cols
+                    ):
                         continue
                     t = s * sample_cols + e
                     if t == last_texel:  # most runs lead to the same one

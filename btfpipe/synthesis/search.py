@@ -10,15 +10,15 @@ the same distance blends feature vectors instead; it serves plain feature images
 """
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import leaf
 from btfpipe.synthesis.exemplar import coarse_texel, texel_under, wrapped
 
 CLOCK, CANDIDATES, FALLBACKS, STARTS, MOVED = range(5)  # places in the tally
-_FAST = {"reassoc", "contract", "nsz"}
+FAST = {"reassoc", "contract", "nsz"}
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _resample(vertex, weight, skip, label, done, tables, base, share, constant, blend):
     """Blend the textons under each pixel of a neighbourhood.
 
@@ -69,7 +69,7 @@ def _resample(vertex, weight, skip, label, done, tables, base, share, constant, 
                 )
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@leaf(fastmath=FAST)
 def square_of_run(a, i, b, j, n):
     """Squared distance of ``a[i:i + n]`` and ``b[j:j + n]``. Unsigned places: signed ones may be negative, and are not vectorised."""
     i = np.uint64(i)
@@ -81,7 +81,7 @@ def square_of_run(a, i, b, j, n):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, inline="always")
+@leaf(fastmath=FAST)
 def _square(
     r, c, side, labels, table, image, width, n, depth, base, share, constant, blend, total, limit
 ):  # fmt: skip
@@ -117,7 +117,7 @@ def _square(
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@leaf(fastmath=FAST)
 def _choose(tries, penalty, count, cols, coarse_side, coarse_sample, coarse, side, sample, fine):
     """Place in `tries` of the texel nearest by penalty times distance, and its distance; the coarser level first."""
     labels, table, image, width, n, depth = sample
@@ -149,7 +149,13 @@ def _choose(tries, penalty, count, cols, coarse_side, coarse_sample, coarse, sid
     return best, best_distance
 
 
-@njit(cache=True, nogil=True)
+def scratch_lists(exemplar, owners):
+    """Room for what `list_candidates` lists of so many owners; one more than can be listed, which it may write to."""
+    most = 1 + max(exemplar.rows * exemplar.cols, owners * exemplar.lists.shape[1])
+    return np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.float32)
+
+
+@leaf
 def list_candidates(
     owners, n, support, kappa, full, lists, cols, inside, compared, stamp, tries, origin, penalty
 ):  # fmt: skip
@@ -165,8 +171,8 @@ def list_candidates(
         Of the `Exemplar`.
     compared : (texels,) int32
         Holds `stamp` for texels already listed.
-    tries, origin, penalty : (at least all that can be listed,) int32, int32, float32
-        Filled in: texel, the owner in whose list it was found (-1 in a full search), factor of its distance.
+    tries, origin, penalty : int32, int32, float32
+        Of `scratch_lists`, filled in: texel, the owner in whose list it was found (-1 in a full search), factor of its distance.
 
     Returns
     -------
@@ -187,12 +193,13 @@ def list_candidates(
         for j in range(n):
             for e in range(1, lists.shape[1]):
                 texel = lists[owners[j], e]
-                if compared[texel] != stamp:
-                    compared[texel] = stamp
-                    tries[count] = texel
-                    origin[count] = j
-                    penalty[count] = np.float32(1.0) + kappa
-                    count += 1
+                tries[count] = (
+                    texel  # and written over by the next if it is there already: no branch to mispredict
+                )
+                origin[count] = j
+                penalty[count] = np.float32(1.0) + kappa
+                count += compared[texel] != stamp
+                compared[texel] = stamp
     if full or count == 0:
         for r in range(low, high):
             for c in range(left, right):
@@ -205,9 +212,26 @@ def list_candidates(
     return count
 
 
-@njit(cache=True, nogil=True)
+def scratch(exemplar, widest):
+    """What `grow` writes down about one vertex, of a patch of up to `widest` vertices.
+
+    The neighbourhoods on this and the coarser level (see `_resample`), the vertex that last compared each texel; where the runs
+    of the patch lead, the texels there, their share of the runs and mean fraction; the candidates.
+    """
+    return (
+        _room(exemplar.fine),
+        _room(exemplar.coarse),
+        np.full(exemplar.rows * exemplar.cols, -1, np.int32),
+        np.empty((widest, 2), np.float32),
+        np.empty(widest, np.int32),
+        np.empty(widest, np.float32),
+        np.empty((widest, 2), np.float32),
+        scratch_lists(exemplar, widest),
+    )
+
+
 def _room(tables):
-    """Scratch for one neighbourhood: base, share, constant, blend."""
+    """Base, share, constant and blend of a neighbourhood."""
     pixels = tables.side * tables.side
     return (
         np.zeros((pixels, 3), np.int32),
@@ -217,10 +241,10 @@ def _room(tables):
     )
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def grow(
     vertices, patches, coarse_vertex, coarse_weight, exemplar, full, skip, kappa, row, col, label, done,
-    visited, moved, distances, coarse_label, tally,
+    visited, moved, distances, coarse_label, room, tally,
 ):  # fmt: skip
     """Synthesise the given vertices in order.
 
@@ -247,27 +271,18 @@ def grow(
     distances : (all vertices,) float32
         Distance of the texel chosen.
     coarse_label : (vertices of the coarser level,) int32
+    room
+        Of `scratch`.
     tally : (5,) int64
         The clock of `visited` and `moved`. Counts: candidates compared, fallbacks, starts (vertices that keep their random texel, having
         no synthesised one near), vertices whose texel changed.
     """
-    fine = _room(exemplar.fine)
-    coarse = _room(exemplar.coarse)
-    compared = np.full(exemplar.rows * exemplar.cols, -1, np.int32)  # the last vertex that did
+    fine, coarse, compared, place, owners, support, fraction, (tries, origin, penalty) = room
+    compared[:] = -1
     pair = (
         exemplar.cols, exemplar.coarse.side, exemplar.coarse.flat, coarse, exemplar.fine.side,
         exemplar.fine.flat, fine,
     )  # fmt: skip
-    widest = patches.patch_vertex.shape[1]
-    place = np.empty((widest, 2), np.float32)  # where the runs of the patch lead
-    owners = np.empty(widest, np.int32)
-    support = np.empty(widest, np.float32)
-    fraction = np.empty((widest, 2), np.float32)
-    always = np.ones(1, np.bool_)
-    most = max(compared.shape[0], widest * exemplar.lists.shape[1])
-    tries = np.empty(most, np.int32)
-    origin = np.empty(most, np.int32)
-    penalty = np.empty(most, np.float32)
     for i in range(vertices.shape[0]):
         v = vertices[i]
         if not _is_news(patches.pixel_vertex[i], patches.patch_vertex[i], visited[v], moved):
@@ -285,10 +300,10 @@ def grow(
         )
         if exemplar.coarse.side > 0:
             _resample(
-                coarse_vertex[i], coarse_weight[i], False, coarse_label, always, exemplar.coarse, *coarse
+                coarse_vertex[i], coarse_weight[i], False, coarse_label, done, exemplar.coarse, *coarse
             )  # fmt: skip
         runs = 0
-        for j in range(widest):
+        for j in range(patches.patch_vertex.shape[1]):
             u = patches.patch_vertex[i, j]
             if u < 0:
                 break
@@ -338,7 +353,7 @@ def grow(
         distances[v] = distance
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _is_news(pixel_vertex, patch_vertex, since, moved):
     """Whether a texel of a neighbourhood or a patch has changed since a time."""
     for p in range(pixel_vertex.shape[0]):
@@ -355,7 +370,7 @@ def _is_news(pixel_vertex, patch_vertex, since, moved):
     return False
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _gather(place, exemplar, compared, i, owners, support, fraction):
     """The distinct texels that the runs of a patch lead to, each with the share of the runs that do and their mean fraction.
 
@@ -391,7 +406,7 @@ def _gather(place, exemplar, compared, i, owners, support, fraction):
     return n
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def inherit(
     face, weight, parent_faces, step, parent_row, parent_col, exemplar, rows, cols, row, col, label
 ):
