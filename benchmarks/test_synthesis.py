@@ -12,7 +12,7 @@ from btfpipe.analysis.neighbours import add_neighbour_lists
 from btfpipe.analysis.pyramid import halve, plain_features
 from btfpipe.analysis.textons import cluster, texton_level
 from btfpipe.surface import Level, Surface
-from btfpipe.surface.flatten import Flattener, Patches
+from btfpipe.surface.flatten import PATCH, Flattener, Patches
 from btfpipe.synthesis import search
 from btfpipe.synthesis.exemplar import exemplar
 from btfpipe.synthesis.growth import breadth_first, grow_over_surface, mean_edge
@@ -144,6 +144,7 @@ def test_distances_on_one_level(benchmark, side):
     ks = (1, 2, 4, 8, 11, 20, 40, 60)
     samples = {k: exemplar(features, 0, k) for k in ks}
     samples["full"] = exemplar(features, 0)
+    rooms = {k: search.scratch(sample, PATCH) for k, sample in samples.items()}
     distances = {k: np.zeros(n, np.float32) for k in samples}
     tallies = {k: np.zeros(5, np.int64) for k in samples}
     state[0][:] = state[1][:] = side // 2
@@ -155,7 +156,7 @@ def test_distances_on_one_level(benchmark, side):
         one = Patches(*(a[i : i + 1] for a in patches))
         search.grow(
             order[i : i + 1], one, *none, samples[k], k == "full", True, np.float32(0), *state, *times,
-            np.zeros(0, np.int32), tallies[k],
+            np.zeros(0, np.int32), rooms[k], tallies[k],
         )  # fmt: skip
         if k != "full":
             for a, old in zip(state, before, strict=True):
