@@ -1,8 +1,15 @@
 """Models: compressed Samples, one module a method, all `Appearance`s."""
 
+import importlib
+
 from btfpipe import store
 from btfpipe.errors import InputError
 from btfpipe.sample import Sample
+
+# Where the Model of each method lives. A further method is one module and a line here.
+MODELS = {
+    "svd": "btfpipe.compression.svd:SvdModel",
+}
 
 
 def open_appearance(path):
@@ -11,11 +18,10 @@ def open_appearance(path):
     if reader.kind == "sample":
         return Sample.from_reader(reader)
     method = reader.about.get("method")
-    if method == "svd":
-        from btfpipe.compression.svd import SvdModel
+    if method not in MODELS:
+        raise InputError(f"{path}: a Model of method {method!r}, which this btfpipe does not know.")
+    module, name = MODELS[method].split(":")
+    return getattr(importlib.import_module(module), name).from_reader(reader)
 
-        return SvdModel.from_reader(reader)
-    raise InputError(f"{path}: a Model of method {method!r}, which this btfpipe does not know.")
 
-
-__all__ = ["open_appearance"]
+__all__ = ["MODELS", "open_appearance"]

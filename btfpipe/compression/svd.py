@@ -15,10 +15,9 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe import store
+from btfpipe.compression.model import Model
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
-from btfpipe.sample.appearance import Appearance
 from btfpipe.sample.transfer import decode_table
 
 _OVERSAMPLING = 10
@@ -31,7 +30,7 @@ _GOOD_ENOUGH = 0.005  # share by which the error may exceed the least possible, 
 _PROCESS_BYTES = 104 << 20  # Python and its libraries, before any work
 
 
-class SvdModel(Appearance):
+class SvdModel(Model):
     """A Sample as ``value[texel, pair, channel] = sum_n texture[texel, n] * angular[pair, channel, n]``.
 
     Parameters
@@ -45,61 +44,27 @@ class SvdModel(Appearance):
         Gives directions, index tables, toroidal, texels_per_mm.
     """
 
+    method = "svd"
+
     def __init__(self, texture_factors, angular_factors, source, about=None):
+        super().__init__(texture_factors.shape[:2], source, about)
         self.texture_factors = texture_factors
         self.angular_factors = angular_factors
-        self.shape = texture_factors.shape[:2]
-        for name in (
-            "light_directions",
-            "view_directions",
-            "light_index",
-            "view_index",
-            "toroidal",
-            "texels_per_mm",
-        ):
-            setattr(self, name, getattr(source, name))
-        self.absolute = getattr(source, "absolute", False)
-        self.about = dict(about or {})
 
     @property
     def n_terms(self):
         return self.texture_factors.shape[2]
 
-    @classmethod
-    def from_reader(cls, reader):
-        """Map the Model from its file."""
-        from types import SimpleNamespace
+    def arrays(self):
+        return {"texture_factors": self.texture_factors, "angular_factors": self.angular_factors}
 
-        about = reader.about
+    @classmethod
+    def from_arrays(cls, reader, source):
         texture = reader.require("texture_factors", (None, None, None), "f")
-        source = SimpleNamespace(
-            light_directions=reader.require("light_directions", (None, 3), "f"),
-            view_directions=reader.require("view_directions", (None, 3), "f"),
-            light_index=reader.require("light_index", (None,), "iu"),
-            view_index=reader.require("view_index", (None,), "iu"),
-            toroidal=about["toroidal"],
-            texels_per_mm=about["texels_per_mm"],
-            absolute=about["absolute"],
-        )
         angular = reader.require(
             "angular_factors", (len(source.light_index), 3, texture.shape[2]), "f"
         )
-        return cls(texture, angular, source, about)
-
-    def save(self, path):
-        """Write the Model."""
-        about = {k: v for k, v in self.about.items() if k not in ("kind", "format", "btfpipe")}
-        about |= {
-            "method": "svd",
-            "toroidal": self.toroidal,
-            "texels_per_mm": self.texels_per_mm,
-            "absolute": self.absolute,
-        }
-        names = ("light_directions", "view_directions", "light_index", "view_index")
-        arrays = {name: getattr(self, name) for name in names}
-        arrays["texture_factors"] = self.texture_factors
-        arrays["angular_factors"] = self.angular_factors
-        store.write(path, "model", arrays, **about)
+        return cls(texture, angular, source, reader.about)
 
     def pictures(self, pairs):
         angular = np.asarray(self.angular_factors[pairs], np.float32)
@@ -118,20 +83,6 @@ class SvdModel(Appearance):
         from btfpipe.compression.svd_shading import SvdShader
 
         return SvdShader(self, interpolation)
-
-    @property
-    def nbytes(self):
-        return int(
-            sum(
-                a.nbytes
-                for a in (
-                    self.texture_factors,
-                    self.angular_factors,
-                    self.light_directions,
-                    self.view_directions,
-                )
-            )
-        )
 
 
 def compress_svd(

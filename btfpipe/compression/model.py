@@ -1,0 +1,125 @@
+"""What Models of every method share: tables of directions, their file, their measured error."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+
+from btfpipe import store
+from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import Appearance
+
+_TABLES = ("light_directions", "view_directions", "light_index", "view_index")
+_BLOCK_BYTES = 4 << 20  # linear pictures compared at a time
+
+
+class Model(Appearance):
+    """A compressed Sample.
+
+    A method is a module with a subclass that names itself in ``method``, gives its ``arrays`` and is made again from them
+    by ``from_arrays``, and evaluates; and a line in `btfpipe.compression`.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and cols of texels.
+    source : Appearance
+        Gives directions, index tables, toroidal, texels_per_mm, absolute.
+    about : dict, optional
+        Facts for the file.
+    """
+
+    method = None
+
+    def __init__(self, shape, source, about=None):
+        self.shape = tuple(int(n) for n in shape)
+        for name in (*_TABLES, "toroidal", "texels_per_mm"):
+            setattr(self, name, getattr(source, name))
+        self.absolute = getattr(source, "absolute", False)
+        self.about = dict(about or {})
+
+    def arrays(self):
+        """The method's own members of the file, by name."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_arrays(cls, reader, source):
+        """The Model again, from a `store.Reader` whose members it checks, and the source of `read_tables`."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_reader(cls, reader):
+        """Map the Model from its file."""
+        return cls.from_arrays(reader, read_tables(reader))
+
+    def save(self, path):
+        """Write the Model."""
+        about = {k: v for k, v in self.about.items() if k not in ("kind", "format", "btfpipe")}
+        about |= {
+            "method": self.method,
+            "toroidal": self.toroidal,
+            "texels_per_mm": self.texels_per_mm,
+            "absolute": self.absolute,
+        }
+        tables = {name: getattr(self, name) for name in _TABLES}
+        store.write(path, "model", tables | self.arrays(), **about)
+
+    @property
+    def nbytes(self):
+        arrays = (*self.arrays().values(), self.light_directions, self.view_directions)
+        return int(sum(array.nbytes for array in arrays))
+
+
+def read_tables(reader):
+    """Directions, index tables and facts of a Model's file, as attributes."""
+    about = reader.about
+    return SimpleNamespace(
+        light_directions=reader.require("light_directions", (None, 3), "f"),
+        view_directions=reader.require("view_directions", (None, 3), "f"),
+        light_index=reader.require("light_index", (None,), "iu"),
+        view_index=reader.require("view_index", (None,), "iu"),
+        toroidal=about["toroidal"],
+        texels_per_mm=about["texels_per_mm"],
+        absolute=about["absolute"],
+    )
+
+
+def measured_error(model, sample, *, threads=1, on_progress=None):
+    """RMSE and relative error of a Model, over all linear values of its Sample.
+
+    Parameters
+    ----------
+    model, sample : Appearance
+        Of the same pairs.
+    threads : int
+        Never changes the result.
+    on_progress : callable, optional
+        Called with (pictures done, pictures in all).
+
+    Returns
+    -------
+    dict
+        ``rmse``, and ``relative_error``: RMS of the error over RMS of the values.
+    """
+    texels = sample.shape[0] * sample.shape[1]
+
+    def work(pairs):
+        reference = np.asarray(sample.pictures(pairs), np.float32).reshape(-1)
+        error = reference - np.asarray(model.pictures(pairs), np.float32).reshape(-1)
+        squares = (
+            float(np.square(a, dtype=np.float64).sum(dtype=np.float64)) for a in (error, reference)
+        )
+        return pairs.stop, *squares
+
+    total, energy = 0.0, 0.0
+    with single_threaded_blas():
+        parts = blocks(sample.n_pairs, max(1, _BLOCK_BYTES // (12 * texels)))
+        for done, squared, square in ordered_map(work, parts, threads):
+            total += squared
+            energy += square
+            if on_progress is not None:
+                on_progress(done, sample.n_pairs)
+    return {
+        "rmse": math.sqrt(total / (3 * texels * sample.n_pairs)),
+        "relative_error": math.sqrt(total / energy) if energy > 0 else 0.0,
+    }
