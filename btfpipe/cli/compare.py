@@ -29,7 +29,7 @@ _DEFINITIONS = {
     "--interpolation",
     "ways",
     multiple=True,
-    type=click.Choice([*_WAYS, "all"]),
+    type=click.Choice([*_WAYS, "reciprocal", "all"]),
     help="Evaluate MODEL between its directions, as rendering does; repeatable. By default only"
     " where SAMPLE has a pair that MODEL lacks, barycentrically.",
 )

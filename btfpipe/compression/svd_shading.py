@@ -9,20 +9,13 @@ from btfpipe.sample.shading import PairWeights, corners
 class SvdShader:
     """Evaluates an `SvdModel` between its texels, lights and views.
 
-    The factors are linear in the values, so blending them (9 pairs barycentrically, 16 of the four nearest,
-    1 of the nearest; 4 texels) is blending the pictures.
+    The factors are linear in the values, so blending them (1, 4, 9 or 16 pairs; 4 texels) is blending the pictures.
 
     Parameters
     ----------
     model : SvdModel
-        Of a product of views and lights.
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
-
-    Raises
-    ------
-    InputError
-        If the Model's pairs are not a product.
+        See `PairWeights`.
     """
 
     def __init__(self, model, interpolation="barycentric"):

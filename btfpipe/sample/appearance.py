@@ -84,7 +84,8 @@ class Appearance:
         w_i, w_o : (n, 3) or (3,)
             Unit vectors to the light and to the eye, in the sample's frame (s, t, n).
         interpolation : str
-            Between measured directions: ``barycentric``, ``four`` or ``nearest``.
+            Between measured directions: ``barycentric``, ``four``, ``nearest`` or ``reciprocal``; see
+            `btfpipe.sample.shading.PairWeights`.
 
         Returns
         -------

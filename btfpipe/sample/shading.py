@@ -1,4 +1,4 @@
-"""Shading straight from a Sample, and the interpolation weights that every shader of a product shares."""
+"""Shading straight from a Sample, and the interpolation weights that shaders share."""
 
 import functools
 import os
@@ -9,6 +9,7 @@ from numba.extending import overload
 
 from btfpipe.directions import Hemisphere
 from btfpipe.directions.interpolation import find
+from btfpipe.directions.pairs import NearestPairs
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks
 from btfpipe.sample.appearance import light_cosines
@@ -26,14 +27,13 @@ class RawShader:
     Parameters
     ----------
     sample : Sample
-        A product of views and lights.
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
+        See `PairWeights`.
 
     Raises
     ------
     InputError
-        If the Sample is not a product, or its copy does not fit the machine.
+        If its copy does not fit the machine.
     """
 
     def __init__(self, sample, interpolation="barycentric"):
@@ -122,46 +122,70 @@ def _overload_value(table, code):
 
 
 class PairWeights:
-    """Finds the pairs of a product that stand for lights and views between the measured ones.
+    """Finds the pairs that stand for lights and views between the measured ones.
 
     Parameters
     ----------
     appearance : Appearance
-        A product of views and lights.
+        Of a product of views and lights, between which lights and views are interpolated separately; in a list of pairs the
+        nearest ones in light-view space are (see `NearestPairs`).
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
+        ``barycentric``: 3 lights and 3 views, the 9 nearest pairs of a list; ``four``: 4 and 4, the 4 nearest pairs of a
+        list; ``nearest``: 1; ``reciprocal``: the 9 nearest pairs, light and view exchangeable.
     """
 
     def __init__(self, appearance, interpolation):
-        appearance.require_product("shading")
-        self.lights = _tables(
-            np.asarray(appearance.light_directions, np.float64).tobytes(), interpolation
+        lights = np.asarray(appearance.light_directions, np.float64)
+        views = np.asarray(appearance.view_directions, np.float64)
+        self.inverse_cosines = 1 / light_cosines(lights)
+        self.near = None
+        if interpolation not in ("barycentric", "four", "nearest", "reciprocal"):
+            raise InputError(
+                f"interpolation {interpolation!r}; expected barycentric, four, nearest or reciprocal."
+            )
+        if appearance.is_product and interpolation != "reciprocal":
+            self.lights, self.views = (_tables(a.tobytes(), interpolation) for a in (lights, views))
+            self.most = {"barycentric": 9, "four": 16, "nearest": 1}[interpolation]
+            return
+        self.most = {"barycentric": 9, "reciprocal": 9, "four": 4, "nearest": 1}[interpolation]
+        self.inverse_cosines = self.inverse_cosines[appearance.light_index]
+        self.near = NearestPairs(
+            lights[appearance.light_index],
+            views[appearance.view_index],
+            self.most,
+            interpolation == "reciprocal",
         )
-        self.views = _tables(
-            np.asarray(appearance.view_directions, np.float64).tobytes(), interpolation
-        )
-        self.inverse_cosines = 1 / light_cosines(appearance.light_directions)
-        self.most = {"barycentric": 9, "four": 16, "nearest": 1}[interpolation]
 
     def blocks(self, w_i, w_o):
         """Yield (slice, pair, share) over blocks of queries (m, 3) float32, unit vectors in the sample's frame.
 
-        `pair` (n, 1, 9 or 16) int32 and `share` of the same shape, float32, are used again for the next block; blocks
+        `pair` (n, `most`) int32 and `share` of the same shape, float32, are used again for the next block; blocks
         keep them in the processor's cache. Between lights value / cos(theta_i) is interpolated and multiplied by
         the true cosine; shares are 0 for a light below the horizon.
         """
         n = min(len(w_i), _QUERIES)
-        index = np.empty((2, n, 4), np.int32)
-        weight = np.empty((2, n, 4))
         pair = np.empty((n, self.most), np.int32)
         share = np.empty((n, self.most), np.float32)
+        if self.near is None:
+            index = np.empty((2, n, 4), np.int32)
+            weight = np.empty((2, n, 4))
         for part in blocks(len(w_i), _QUERIES):
             n = part.stop - part.start
-            find(self.lights, w_i[part], index[0, :n], weight[0, :n])
-            find(self.views, w_o[part], index[1, :n], weight[1, :n])
-            _combine(
-                self.inverse_cosines, w_i[part], index[:, :n], weight[:, :n], pair[:n], share[:n]
-            )
+            if self.near is None:
+                find(self.lights, w_i[part], index[0, :n], weight[0, :n])
+                find(self.views, w_o[part], index[1, :n], weight[1, :n])
+                _combine(
+                    self.inverse_cosines,
+                    w_i[part],
+                    index[:, :n],
+                    weight[:, :n],
+                    pair[:n],
+                    share[:n],
+                )
+            else:
+                self.near.find(w_i[part], w_o[part], pair[:n], share[:n])
+                share[:n] *= self.inverse_cosines[pair[:n]]
+                share[:n] *= np.maximum(w_i[part, 2:], 0)
             yield part, pair[:n], share[:n]
 
 

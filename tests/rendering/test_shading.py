@@ -6,7 +6,7 @@ import pytest
 from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import Hemisphere, from_angles
 from btfpipe.errors import InputError
-from btfpipe.sample import Sample, light_cosines
+from btfpipe.sample import light_cosines
 from btfpipe.sample.shading import RawShader
 
 INTERPOLATIONS = ("barycentric", "four", "nearest")
@@ -82,19 +82,9 @@ def test_many_queries_are_shaded_as_one_by_one(make_sample, rng):
     )
 
 
-def test_lists_of_pairs_are_refused(make_sample):
-    full = make_sample()
-    sample = Sample(
-        full.codes[:-1],
-        full.light_directions,
-        full.view_directions,
-        full.light_index[:-1],
-        full.view_index[:-1],
-    )
-    with pytest.raises(InputError, match="shading needs every view under every light"):
-        sample.shader()
-    with pytest.raises(InputError, match="expected barycentric, four or nearest"):
-        RawShader(full, "cubic")
+def test_an_unknown_interpolation_is_refused(make_sample):
+    with pytest.raises(InputError, match="expected barycentric, four, nearest or reciprocal"):
+        RawShader(make_sample(), "cubic")
 
 
 def test_float32_codes_with_a_curve_are_refused(make_sample):
