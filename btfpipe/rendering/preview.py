@@ -193,13 +193,13 @@ def _write(label, strip, scale):
 
 
 def sample_sheet(appearance, lights=6, views=6):
-    """Linear pictures of evenly chosen pairs, views down and lights across.
+    """Linear pictures of evenly chosen pairs: views down and lights across, or a list's pairs row by row.
 
     Parameters
     ----------
     appearance : Appearance
     lights, views : int
-        At most this many of each.
+        At most this many of each; of a list of pairs at most their product.
 
     Returns
     -------
@@ -209,33 +209,33 @@ def sample_sheet(appearance, lights=6, views=6):
     """
     from btfpipe.directions import to_angles
 
-    light = _spread(appearance.light_directions, lights)
-    view = _spread(appearance.view_directions, views)
-    pair_of = {
-        (int(v), int(i)): n
-        for n, (v, i) in enumerate(zip(appearance.view_index, appearance.light_index, strict=True))
-    }
-    pictures, labels = [], []
-    for v in view:
-        for i in light:
-            angles = [
-                np.degrees(to_angles(d))
-                for d in (appearance.light_directions[i], appearance.view_directions[v])
-            ]
-            labels.append("light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(*np.concatenate(angles)))
-            if (v, i) in pair_of:
-                pictures.append(np.asarray(appearance.pictures([pair_of[v, i]])[0]))
-            else:
-                pictures.append(np.zeros((*appearance.shape, 3), np.float32))
-    return pictures, labels, len(light)
+    w_i, w_o = (np.asarray(a) for a in (appearance.light_directions, appearance.view_directions))
+    of_light, of_view = np.asarray(appearance.light_index), np.asarray(appearance.view_index)
+    if appearance.is_product:
+        light, view = _spread(w_i, w_i[:, 2], lights), _spread(w_o, w_o[:, 2], views)
+        pairs = [v * len(w_i) + i for v in view for i in light]
+        columns = len(light)
+    else:
+        points = np.concatenate([w_i[of_light], w_o[of_view]], axis=1)
+        pairs = _spread(points, points[:, 2] + points[:, 5], lights * views)
+        columns = min(lights, len(pairs))
+    pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
+    labels = [
+        "light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(
+            *np.degrees(to_angles(w_i[of_light[pair]])), *np.degrees(to_angles(w_o[of_view[pair]]))
+        )
+        for pair in pairs
+    ]
+    return pictures, labels, columns
 
 
-def _spread(directions, count):
-    """Indices of directions far from each other, the most frontal first, in the order of the set."""
-    chosen = [int(np.argmax(directions[:, 2]))]
-    while len(chosen) < min(count, len(directions)):
-        distance = np.linalg.norm(directions[:, None] - directions[chosen], axis=2).min(axis=1)
+def _spread(points, frontal, count):
+    """Indices of points far from each other, the most frontal first, in the order of the set."""
+    chosen = [int(np.argmax(frontal))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)):
         chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return sorted(chosen)
 
 

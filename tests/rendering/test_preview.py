@@ -150,3 +150,21 @@ def test_other_files_are_refused(exr, make_sample, btfpipe, tmp_path):
         "preview", tmp_path / "s.npz", "--layer", "depth", "-o", tmp_path / "p.png", code=3
     )
     assert "has no layer depth" in layer.stderr
+
+
+def test_the_sheet_of_a_list_of_pairs_shows_pairs_that_are_there(make_sample):
+    from btfpipe.rendering.preview import sample_sheet
+    from btfpipe.sample import Sample
+
+    product = make_sample(8, 8)
+    diagonal = np.arange(0, product.n_pairs, 8)  # no product, and most combinations are missing
+    listed = Sample(
+        product.codes[diagonal], product.light_directions, product.view_directions,
+        product.light_index[diagonal], product.view_index[diagonal],
+    )  # fmt: skip
+    pictures, labels, columns = sample_sheet(listed, 4, 3)
+    assert len(pictures) == 12
+    assert columns == 4
+    assert len(set(labels)) == 12
+    stored = list(listed.pictures(slice(None)))
+    assert all(any(np.array_equal(p, q) for q in stored) for p in pictures)
