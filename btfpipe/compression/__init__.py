@@ -1,15 +1,26 @@
 """Models: compressed Samples, one module a method, all `Appearance`s."""
 
 import importlib
+from collections import namedtuple
 
 from btfpipe import store
 from btfpipe.errors import InputError
 from btfpipe.sample import Sample
 
-# Where the Model of each method lives. A further method is one module and a line here.
-MODELS = {
-    "svd": "btfpipe.compression.svd:SvdModel",
+# A method of compression: its module, the class of its Models, the function that makes one (None for Models that only come from
+# files), and which options it takes: the name on the command line and that of the function's argument.
+Method = namedtuple("Method", "module model function options")
+
+# A further method is one module and an entry here.
+METHODS = {
+    "svd": Method(
+        "btfpipe.compression.svd",
+        "SvdModel",
+        "compress_svd",
+        {"components": "n_terms", "precision": "precision", "iterations": "iterations"},
+    ),
 }
+DATABASES = ("local-pca",)  # methods that take several samples at once
 
 
 def open_appearance(path):
@@ -17,11 +28,45 @@ def open_appearance(path):
     reader = store.read(path, ("sample", "model"))
     if reader.kind == "sample":
         return Sample.from_reader(reader)
-    method = reader.about.get("method")
-    if method not in MODELS:
-        raise InputError(f"{path}: a Model of method {method!r}, which this btfpipe does not know.")
-    module, name = MODELS[method].split(":")
-    return getattr(importlib.import_module(module), name).from_reader(reader)
+    name = reader.about.get("method")
+    if name not in METHODS:
+        raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
+    method = METHODS[name]
+    return getattr(importlib.import_module(method.module), method.model).from_reader(reader)
 
 
-__all__ = ["MODELS", "open_appearance"]
+def compress(samples, method, *, seed=0, threads=1, memory=2 << 30, on_progress=None, **options):
+    """Make a Model of one Sample or, for a database, of several.
+
+    Parameters
+    ----------
+    samples : list of Appearance
+        One, except for a method in `DATABASES`.
+    method : str
+        A key of `METHODS` that has a function.
+    seed, threads, memory, on_progress
+        See the method's function.
+    **options
+        Those of the method, by their names on the command line; None leaves one at the method's default.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    InputError
+        If the method refuses the samples.
+    """
+    chosen = METHODS[method]
+    function = getattr(importlib.import_module(chosen.module), chosen.function)
+    if method not in DATABASES:
+        (samples,) = samples
+    return function(
+        samples,
+        **{chosen.options[name]: value for name, value in options.items() if value is not None},
+        seed=seed, threads=threads, memory=memory, on_progress=on_progress,
+    )  # fmt: skip
+
+
+__all__ = ["DATABASES", "METHODS", "compress", "open_appearance"]

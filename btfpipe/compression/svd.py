@@ -138,7 +138,7 @@ def compress_svd(
     most = min(texels, 3 * sample.n_pairs)
     if n_terms < 1:
         raise InputError(f"{n_terms} terms asked for; expected at least 1.")
-    n_terms = min(n_terms, most)
+    asked, n_terms = n_terms, min(n_terms, most)
     import scipy.linalg  # noqa: F401 (before its BLAS is limited to one thread)
 
     width = min(n_terms + _OVERSAMPLING, most)
@@ -185,6 +185,15 @@ def compress_svd(
         "relative_error": math.sqrt(squared_error / energy) if energy > 0 else 0.0,
         "singular_values": [float(f"{value:.6g}") for value in singular],
     }
+    if asked > most:
+        model.about["warnings"] = [
+            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
+            f" {asked - most} terms left out"
+        ]
+    if n_terms < min(asked, most):
+        model.about.setdefault("warnings", []).append(
+            f"the sample's rank is {n_terms}: {min(asked, most) - n_terms} terms left out"
+        )
     passes.finish()
     return model
 
