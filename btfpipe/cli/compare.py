@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, naming, progress, stage
 
 _WAYS = ("barycentric", "four", "nearest")
 _DEFINITIONS = {
@@ -23,8 +23,13 @@ _DEFINITIONS = {
 
 
 @click.command()
-@click.argument("model", type=input_file())
-@click.argument("sample", type=input_file())
+@click.argument("files", nargs=-1, required=True, metavar="[MODEL] SAMPLE", type=input_file())
+@click.option(
+    "--sweep",
+    is_flag=True,
+    help="Compress SAMPLE by every method at several sizes instead, and measure each; the picture shows PSNR"
+    " against the ratio of bytes.",
+)
 @click.option(
     "--interpolation",
     "ways",
@@ -39,7 +44,7 @@ _DEFINITIONS = {
     help="Picture to write: errors over all pairs; the best, middle and worst picture.",
 )
 @stage(out="optional", outputs=("picture",))
-def compare(model, sample, ways, picture, out, threads, quiet):
+def compare(files, sweep, ways, picture, out, seed, threads, memory, quiet):
     """Measure how far MODEL (a Model or a Sample) is from SAMPLE, at all of SAMPLE's direction pairs.
 
     Writes a report in JSON: RMSE, PSNR, relative error and SSIM, overall and for each pair; bytes and their ratio.
@@ -49,14 +54,81 @@ def compare(model, sample, ways, picture, out, threads, quiet):
     Examples:
       btfpipe compare corduroy.model.npz corduroy.sample.npz -o fidelity.json --picture fidelity.png
       btfpipe compare weave.model.npz weave_truth.sample.npz --interpolation all -o truth.json
-    """  # fmt: skip
+      btfpipe compare --sweep weave.sample.npz -o sweep.json --picture sweep.png
+    """
+    if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".tif"):
+        raise click.UsageError(f"{picture}: not a picture's name; end it in .png.")
+    wanted = "one file, SAMPLE" if sweep else "two files, MODEL and SAMPLE"
+    if len(files) != (1 if sweep else 2):
+        raise click.UsageError(f"{len(files)} files are given; expected {wanted}.")
+    if not sweep:
+        return _compare(*files, ways, picture, out, threads, quiet)
+    if ways:
+        raise click.UsageError(
+            "--sweep measures at the sample's own pairs; leave --interpolation out."
+        )
+    return _sweep(files[0], picture, out, seed, threads, memory, quiet)
+
+
+def _sweep(path, picture, out, seed, threads, memory, quiet):
+    """Compress a Sample in many ways: report, picture, summary."""
+    from btfpipe import store
+    from btfpipe.compression.sweep import draw_sweep, sweep
+    from btfpipe.metrics import comparison, raw_bytes
+    from btfpipe.sample import Sample
+
+    sample = Sample.open(path)
+    with naming(path), progress("compare: files", quiet) as report:
+        rows = sweep(sample, seed=seed, threads=threads, memory=memory, on_progress=report)
+    facts = {
+        "texels": list(sample.shape),
+        "pairs": sample.n_pairs,
+        "sample_bytes": raw_bytes(sample),
+        "sweep": rows,
+    }
+    with contextlib.ExitStack() as files:  # both appear, or neither
+        if out is not None:
+            definitions = _DEFINITIONS | {"white": comparison.white_level(sample)[1]}
+            about = {"sample": {"file": path.name, "digest": store.digest(path)}}
+            store.put_json(
+                files.enter_context(store.whole(out, "w")),
+                about | facts | {"definitions": definitions},
+            )
+        if picture is not None:
+            drawn = draw_sweep(
+                rows,
+                f"{path.name}: {' x '.join(map(str, sample.shape))} texels, {sample.n_pairs} pairs",
+            )
+            files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
+    if not quiet:
+        for row in rows:
+            options = " ".join(
+                f"--{name.replace('_', '-')} {value}" for name, value in row["options"].items()
+            )
+            what = row.get("skipped") or (
+                f"{row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
+                f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s"
+            )
+            click.echo(f"{row['method']} {options}: {what}", err=True)
+    return {"inputs": [path], **facts}
+
+
+def _encoded(png, picture):
+    """A PNG in the format that a picture's name asks for."""
+    if picture.suffix.lower() == ".png":
+        return png
+    from btfpipe.formats.images import encode_picture, read_picture
+
+    return encode_picture(read_picture(png)[..., :3], picture.suffix.lower())
+
+
+def _compare(model, sample, ways, picture, out, threads, quiet):
+    """Compare a Model with a Sample: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression import open_appearance
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
-    if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".tif"):
-        raise click.UsageError(f"{picture}: not a picture's name; end it in .png.")
     reference = Sample.open(sample)
     stand_in = open_appearance(model)
     ways = _WAYS if "all" in ways else tuple(dict.fromkeys(ways))

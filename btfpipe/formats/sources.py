@@ -1,0 +1,52 @@
+"""Which format a source has: told by looking, in one table that `ingest` and `info` share."""
+
+import importlib
+from collections import namedtuple
+
+from btfpipe.errors import InputError
+
+# A format that can be read. `module` holds recognise(path), which gives a reason in words or None, and `opener`: a context manager that
+# yields a Measurement, or gives a Model. `options`: the opener's arguments that a user may set.
+Format = namedtuple("Format", "module opener options")
+
+# In the order of asking: the particular before the general.
+FORMATS = {
+    "ptm": Format("btfpipe.formats.ptm", "read_model", ()),
+    "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
+    "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),
+    "utia": Format(
+        "btfpipe.formats.utia", "open_measurement", ("pairs", "frontal", "directions", "colour")
+    ),
+    "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs", "frontal")),
+    "curet": Format("btfpipe.formats.curet", "open_measurement", ("sample_number",)),
+    "picture": Format("btfpipe.formats.pictures", "open_measurement", ()),
+}
+
+
+def recognise(path):
+    """The format of a file, folder or zip, and why: (str, str).
+
+    Raises
+    ------
+    InputError
+        If it is none of those in `FORMATS`.
+    """
+    for name, format_ in FORMATS.items():
+        reason = importlib.import_module(format_.module).recognise(path)
+        if reason:
+            return name, reason
+    raise InputError(
+        f"{path}: of no format that btfpipe reads ({', '.join(FORMATS)}). `btfpipe info {path}` says what it finds;"
+        " --format takes it for one all the same."
+    )
+
+
+def open_source(path, name, **options):
+    """Open a source as the named format.
+
+    Returns
+    -------
+    context manager of a Measurement, or Model
+    """
+    format_ = FORMATS[name]
+    return getattr(importlib.import_module(format_.module), format_.opener)(path, **options)
