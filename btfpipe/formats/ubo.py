@@ -20,7 +20,7 @@ from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
 
 SETTINGS = "btfpipe.json"
-_ENDINGS = (".jpg", ".jpeg", ".png", ".exr")
+_ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
