@@ -47,6 +47,18 @@ def open_archive(path):
     return Zip(path)
 
 
+def names_in(path):
+    """Names of the files in a folder or zip; none for anything else, or if it cannot be read."""
+    path = Path(path)
+    if not path.is_dir() and not is_zip(path):
+        return []
+    try:
+        with open_archive(path) as archive:
+            return archive.names
+    except InputError:
+        return []
+
+
 class Folder:
     """The files below a folder; names are relative, with forward slashes.
 
