@@ -71,7 +71,7 @@ class Listing:
             hidden = base.startswith(".") or "__MACOSX/" in name
             angles = parse_name(base)
             if base == SETTINGS:
-                self.settings = _settings(archive, name)
+                self.settings = read_settings(archive, name)
             elif angles is None or hidden or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)
             else:
@@ -122,8 +122,8 @@ def direction(angles, label):
     return (theta, round(phi % 360, 6) % 360 if theta > 0 else 0.0)
 
 
-def _settings(archive, name):
-    """Check the settings of a simulated set."""
+def read_settings(archive, name):
+    """Settings of a set that btfpipe wrote, checked."""
     label = archive.label(name)
     try:
         settings = json.loads(archive.read(name))
@@ -131,6 +131,11 @@ def _settings(archive, name):
         raise InputError(f"{label}: not JSON ({error}).") from error
     if not isinstance(settings, dict):
         raise InputError(f"{label}: holds no mapping of settings.")
+    return check_settings(settings, label)
+
+
+def check_settings(settings, label):
+    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
     white, transfer = settings.get("white"), settings.get("transfer")
     density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
     for key, value in (("white", white), ("texels_per_mm", density)):
