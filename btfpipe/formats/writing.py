@@ -111,6 +111,8 @@ class Pictures:
         Of ``.jpg``.
     convert : function, optional
         Applied to linear pictures (n, rows, cols, 3) before they are encoded as floats.
+    pairs : (n,) int, optional
+        Which pairs; all by default.
     threads : int
         Never changes the result.
 
@@ -136,6 +138,7 @@ class Pictures:
         precision="half",
         quality=95,
         convert=None,
+        pairs=None,
         threads=1,
     ):
         if suffix not in (".exr", *CURVES):
@@ -145,7 +148,8 @@ class Pictures:
         self.appearance, self.suffix, self.quality = appearance, suffix, quality
         self.convert, self.threads, self.precision = convert, threads, precision
         rows, cols = appearance.shape
-        self._blocks = blocks(appearance.n_pairs, max(1, _BLOCK_BYTES // (12 * rows * cols)))
+        self.pairs = np.arange(appearance.n_pairs) if pairs is None else np.asarray(pairs)
+        self._blocks = blocks(len(self.pairs), max(1, _BLOCK_BYTES // (12 * rows * cols)))
         self.white, largest = 1.0, None
         self.transfer = "linear"
         if suffix != ".exr":
@@ -162,11 +166,11 @@ class Pictures:
             "toroidal": bool(appearance.toroidal),
             "texels_per_mm": appearance.texels_per_mm,
         }
-        self.facts = {"pictures": appearance.n_pairs, "white": self.white, "largest": largest}
+        self.facts = {"pictures": len(self.pairs), "white": self.white, "largest": largest}
 
     def _largest(self):
-        def work(pairs):
-            return self.appearance.pictures(pairs).max()
+        def work(block):
+            return self.appearance.pictures(self.pairs[block]).max()
 
         largest = float(np.max(list(ordered_map(work, self._blocks, self.threads))))
         if not np.isfinite(largest):
@@ -176,16 +180,15 @@ class Pictures:
     def encoded(self, on_progress=None):
         """Yield (pair, bytes of its picture) in order."""
 
-        def work(pairs):
-            values = self.appearance.pictures(pairs)
-            return pairs, [
-                encode_picture(p, self.suffix, self.quality) for p in self._codes(values)
-            ]
+        def work(block):
+            values = self.appearance.pictures(self.pairs[block])
+            codes = self._codes(values)
+            return block, [encode_picture(picture, self.suffix, self.quality) for picture in codes]
 
-        for pairs, pictures in ordered_map(work, self._blocks, self.threads):
-            yield from zip(range(pairs.start, pairs.stop), pictures, strict=True)
+        for block, pictures in ordered_map(work, self._blocks, self.threads):
+            yield from zip(self.pairs[block].tolist(), pictures, strict=True)
             if on_progress is not None:
-                on_progress(pairs.stop, self.appearance.n_pairs)
+                on_progress(block.stop, len(self.pairs))
 
     def _codes(self, values):
         if self.suffix != ".exr":
