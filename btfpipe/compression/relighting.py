@@ -74,11 +74,11 @@ class RelightingModel(Model):
 
     Parameters
     ----------
-    codes : (rows, cols, 3 or 1, n) uint8
-        Coefficients are ``code * scale + offset``, of display values with 1 as white.
+    coefficients : (rows, cols, 3 or 1, n) uint8
+        Codes of them, ``code * scale + offset``, for display values with 1 as white.
     scale, offset : (n,) float32
     colour : (rows, cols, 3) uint8, optional
-        With one channel of codes: 255 times the colour that the channel is multiplied by.
+        With one channel of coefficients: 255 times the colour that the channel is multiplied by.
     basis : str
         ``ptm`` (6 terms) or ``hsh`` (1, 4, 9 or 16).
     transfer : str
@@ -95,36 +95,38 @@ class RelightingModel(Model):
     method = "relighting"
 
     def __init__(
-        self, codes, scale, offset, colour, basis, transfer, *, source=None, about=None
+        self, coefficients, scale, offset, colour, basis, transfer, *, source=None, about=None
     ):  # fmt: skip
-        super().__init__(codes.shape[:2], source or _nominal(), about)
-        n = codes.shape[3]
+        super().__init__(coefficients.shape[:2], source or _nominal(), about)
+        n = coefficients.shape[3]
         if basis not in TERMS or n not in TERMS[basis]:
             raise InputError(f"{n} terms of the basis {basis!r}; expected one of {TERMS}.")
         if transfer not in TRANSFERS:
             raise InputError(f"transfer {transfer!r}; expected one of {', '.join(TRANSFERS)}.")
-        if codes.shape[2] != (3 if colour is None else 1):
+        if coefficients.shape[2] != (3 if colour is None else 1):
             raise InputError(
-                f"{codes.shape[2]} channels of coefficients; expected 3, or 1 beside a colour."
+                f"{coefficients.shape[2]} channels of coefficients; expected 3, or 1 beside a colour."
             )
-        self.codes, self.colour = codes, colour
+        self.coefficients, self.colour = coefficients, colour
         self.scale, self.offset = (np.asarray(a, np.float32) for a in (scale, offset))
         self.basis, self.transfer = basis, transfer
         self.about |= {"basis": basis, "n_terms": n, "transfer": transfer}
 
     def arrays(self):
-        arrays = {"codes": self.codes, "scale": self.scale, "offset": self.offset}
+        arrays = {"coefficients": self.coefficients, "scale": self.scale, "offset": self.offset}
         return arrays if self.colour is None else arrays | {"colour": self.colour}
 
     @classmethod
     def from_arrays(cls, reader, source):
-        codes = reader.require("codes", (None, None, None, None), "u")
-        n = (codes.shape[3],)
+        coefficients = reader.require("coefficients", (None, None, None, None), "u")
+        n = (coefficients.shape[3],)
         return cls(
-            codes,
+            coefficients,
             reader.require("scale", n, "f"),
             reader.require("offset", n, "f"),
-            reader.require("colour", (*codes.shape[:2], 3), "u") if "colour" in reader else None,
+            reader.require("colour", (*coefficients.shape[:2], 3), "u")
+            if "colour" in reader
+            else None,
             reader.about.get("basis"),
             reader.about.get("transfer"),
             source=source,
@@ -133,7 +135,7 @@ class RelightingModel(Model):
 
     def weights(self, directions):
         """What codes (n, terms) float32 count under lights (n, 3), and what is added (n,) float32."""
-        basis = evaluate_basis(self.basis, self.codes.shape[3], directions)
+        basis = evaluate_basis(self.basis, self.coefficients.shape[3], directions)
         return (basis * self.scale).astype(np.float32), (basis @ self.offset).astype(np.float32)
 
     def _values(self, codes, colour, pairs):
@@ -148,7 +150,7 @@ class RelightingModel(Model):
         return values * (lights[:, 2] > 0)[:, None]
 
     def pictures(self, pairs):
-        codes = np.asarray(self.codes).reshape(-1, *self.codes.shape[2:])
+        codes = np.asarray(self.coefficients).reshape(-1, *self.coefficients.shape[2:])
         colour = None if self.colour is None else np.asarray(self.colour).reshape(-1, 3)
         index = np.arange(self.n_pairs)[pairs]
         out = np.empty((len(index), *self.shape, 3), np.float32)
@@ -160,7 +162,7 @@ class RelightingModel(Model):
 
     def texels(self, rows, cols):
         colour = None if self.colour is None else self.colour[rows, cols]
-        return self._values(self.codes[rows, cols], colour, slice(None))
+        return self._values(self.coefficients[rows, cols], colour, slice(None))
 
     def shader(self, interpolation="barycentric"):
         return RelightingShader(self)
@@ -185,7 +187,9 @@ class RelightingShader:
     def __init__(self, model):
         self.model = model
         self.rows, self.cols = model.shape
-        self.codes = np.ascontiguousarray(model.codes).reshape(-1, *model.codes.shape[2:])
+        self.codes = np.ascontiguousarray(model.coefficients).reshape(
+            -1, *model.coefficients.shape[2:]
+        )
         self.colour = np.zeros((0, 3), np.uint8)
         if model.colour is not None:
             self.colour = np.ascontiguousarray(model.colour).reshape(-1, 3)

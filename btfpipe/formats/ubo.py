@@ -21,7 +21,7 @@ from btfpipe.sample.transfer import TRANSFERS
 
 SETTINGS = "btfpipe.json"
 _ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
-_KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
+_KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _=:]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
 def parse_name(name):

@@ -14,6 +14,7 @@ from btfpipe.errors import InputError
 from btfpipe.formats.images import encode_picture
 from btfpipe.formats.ubo import SETTINGS
 from btfpipe.parallel import blocks, ordered_map
+from btfpipe.sample import Sample
 from btfpipe.sample.transfer import encode
 
 _BLOCK_BYTES = 4 << 20  # linear pictures at a time
@@ -153,7 +154,7 @@ class Pictures:
         self.white, largest = 1.0, None
         self.transfer = "linear"
         if suffix != ".exr":
-            eight = getattr(appearance, "codes", np.zeros(0)).dtype == np.uint8
+            eight = isinstance(appearance, Sample) and appearance.codes.dtype == np.uint8
             self.transfer = transfer or (appearance.transfer if eight else CURVES[suffix])
             if eight and appearance.gain is None:
                 self.white = 1 / appearance.scale

@@ -27,8 +27,8 @@ def naive(model, i, j, light):
     if model.basis == "ptm":
         basis = [x * x, y * y, x * y, x, y, 1]
     else:
-        basis = [harmonic(k, light) for k in range(model.codes.shape[3])]
-    coefficients = model.codes[i, j].astype(float) * model.scale + model.offset
+        basis = [harmonic(k, light) for k in range(model.coefficients.shape[3])]
+    coefficients = model.coefficients[i, j].astype(float) * model.scale + model.offset
     display = np.maximum(coefficients @ np.array(basis), 0)
     if model.colour is not None:
         display = display * model.colour[i, j] / 255

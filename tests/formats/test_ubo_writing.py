@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from btfpipe.compression.relighting import RelightingModel
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
@@ -83,3 +84,14 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path, make_sam
     (tmp_path / "set").mkdir()
     with pytest.raises(InputError, match="not written by btfpipe"):
         write_ubo(tmp_path / "set", make_sample(2, 2), ".png")
+
+
+def test_a_model_is_written_as_its_pictures(tmp_path, rng):
+    codes = rng.integers(0, 256, (5, 6, 3, 6), np.uint8)
+    model = RelightingModel(codes, np.ones(6) / 600, np.zeros(6), None, "ptm", "srgb")
+    write_ubo(tmp_path / "set", model, ".png")
+    back = read_back(tmp_path / "set", tmp_path / "s.npz")
+    expected = model.pictures([0, 40, 80])
+    largest = model.pictures(slice(0, 81)).max()
+    # the model's scale is unknown, so its largest value became the largest code
+    np.testing.assert_allclose(back.pictures([0, 40, 80]) * max(largest, 1), expected, atol=0.01)
