@@ -36,7 +36,7 @@ COLUMNS = {
 }
 LIST = "directions.csv"
 _ENDINGS = (".csv", ".json")
-_MOST_LIST = 1 << 26  # bytes
+_MOST_LIST = 1 << 24  # bytes
 
 # A list as read: member, which of COLUMNS it has, names of pictures, numbers (pairs, 4 or 6), settings.
 _List = namedtuple("_List", "member kind names numbers settings")

@@ -134,7 +134,7 @@ def _unpack(data, pixels):
             8 <= length <= 32767
             and data[at] == 2
             and data[at + 1] == 2
-            and (data[at + 2] << 8 | data[at + 3]) == length
+            and np.int64(data[at + 2]) * 256 + data[at + 3] == length
         )
         if packed:  # the four components one after another, each in runs and stretches
             at += 4
