@@ -224,7 +224,7 @@ def write_utia(path, appearance, suffix=".png", *, colour="xyz", on_progress=Non
     path : path-like
         A zip if it ends in ``.zip``, else a folder.
     appearance : Appearance
-        A product or a list of pairs; names say the true angles.
+        A product or a list of pairs; names say the true angles, shifted lights included.
     suffix : str
         ``.png`` (sRGB) or ``.exr``.
     colour : str
