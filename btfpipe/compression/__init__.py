@@ -19,6 +19,7 @@ METHODS = {
         "compress_svd",
         {"components": "n_terms", "precision": "precision", "iterations": "iterations"},
     ),
+    "relighting": Method("btfpipe.compression.relighting", "RelightingModel", None, {}),
 }
 DATABASES = ("local-pca",)  # methods that take several samples at once
 

@@ -3,6 +3,7 @@
 Nothing is unpacked; a zip's members are read by their place in the file, on any number of threads at once.
 """
 
+import contextlib
 import os
 import re
 import struct
@@ -47,6 +48,18 @@ def open_archive(path):
     return Zip(path)
 
 
+def names_in(path):
+    """Names of the files in a folder or zip; none for anything else, or if it cannot be read."""
+    path = Path(path)
+    if not path.is_dir() and not is_zip(path):
+        return []
+    try:
+        with open_archive(path) as archive:
+            return archive.names
+    except InputError:
+        return []
+
+
 class Folder:
     """The files below a folder; names are relative, with forward slashes.
 
@@ -70,6 +83,12 @@ class Folder:
             return (self.path / name).read_bytes()
         except OSError as error:
             raise InputError(f"{self.path / name}: cannot be read ({error.strerror}).") from error
+
+    def size(self, name):
+        """Bytes of one file; 0 if it vanished."""
+        with contextlib.suppress(OSError):
+            return (self.path / name).stat().st_size
+        return 0
 
     def label(self, name):
         """What messages call a file."""
@@ -163,6 +182,10 @@ class Zip:
         if len(data) != info.file_size or zlib.crc32(data) != info.CRC:
             raise InputError(f"{self.label(name)}: damaged in the archive (wrong checksum).")
         return data
+
+    def size(self, name):
+        """Bytes of one member, unpacked."""
+        return self._members[name].file_size
 
     def label(self, name):
         """What messages call a member."""

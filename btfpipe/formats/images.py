@@ -1,4 +1,4 @@
-"""Pictures through OpenImageIO: JPEG, PNG, TIFF, EXR, HDR, in and out.
+"""Pictures through OpenImageIO: JPEG, PNG, TIFF, EXR, HDR, in and out; Radiance pictures are read by `rgbe`.
 
 Arrays are (rows, cols, channels), row 0 at the top. Colours are left as stored: no colour management, alpha not
 multiplied in.
@@ -15,6 +15,7 @@ import numpy as np
 
 from btfpipe import store
 from btfpipe.errors import InputError
+from btfpipe.formats.rgbe import decode_rgbe
 
 _MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 _MAX_PIXELS = 2**28
@@ -24,7 +25,7 @@ _SIGNATURES = [
     (b"\xff\xd8\xff", ".jpg"),
     (b"\x89PNG\r\n\x1a\n", ".png"),
     (b"\x76\x2f\x31\x01", ".exr"),
-    (b"#?R", ".hdr"),
+    (b"#?", ".hdr"),
     (b"II*\0", ".tif"),
     (b"MM\0*", ".tif"),
     (b"BM", ".bmp"),
@@ -100,6 +101,8 @@ class Decoder:
         if not len(data):
             raise InputError(f"{name}: empty; expected a picture.")
         suffix = picture_suffix(bytes(data[:16]))
+        if suffix == ".hdr":
+            return _radiance(data, name)
         try:
             file, path = self._file(suffix or ".picture")
             os.pwrite(file, data, 0)
@@ -111,9 +114,16 @@ class Decoder:
         return _decode_file(path, name, suffix)
 
 
+def _radiance(data, name):
+    return Picture(decode_rgbe(data, name), ("R", "G", "B"), ".hdr")
+
+
 def _decode_file(path, name, suffix):
     """Decode the picture file at `path`; messages call it `name`."""
     import OpenImageIO as oiio
+
+    if suffix == ".hdr":
+        return _radiance(Path(path).read_bytes(), name)
 
     def reason(text):
         text = (text or "unknown format").replace(f' ("{path}")', "").replace(str(path), str(name))

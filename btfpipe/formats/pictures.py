@@ -5,8 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from btfpipe.formats.images import colours, open_picture
+from btfpipe.formats.images import colours, open_picture, picture_suffix
 from btfpipe.sample.measurement import Measurement
+
+
+def recognise(path):
+    """Why a file is taken for a picture, in words, or None."""
+    try:
+        with Path(path).open("rb") as file:
+            suffix = picture_suffix(file.read(16))
+    except OSError:
+        return None
+    return suffix and f"begins as a picture does ({suffix[1:]})"
 
 
 @contextlib.contextmanager

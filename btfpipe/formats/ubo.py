@@ -14,14 +14,14 @@ import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import COPY, open_archive
+from btfpipe.formats.archive import COPY, names_in, open_archive
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
 from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
 
 SETTINGS = "btfpipe.json"
-_ENDINGS = (".jpg", ".jpeg", ".png", ".exr")
-_KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
+_ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
+_KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _=:]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
 def parse_name(name):
@@ -71,11 +71,11 @@ class Listing:
             hidden = base.startswith(".") or "__MACOSX/" in name
             angles = parse_name(base)
             if base == SETTINGS:
-                self.settings = _settings(archive, name)
+                self.settings = read_settings(archive, name)
             elif angles is None or hidden or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)
             else:
-                light, view = (_direction(a, archive.label(name)) for a in angles)
+                light, view = (direction(a, archive.label(name)) for a in angles)
                 if (view, light) in pairs:
                     self.duplicates.append((pairs[view, light], name))
                 else:
@@ -96,8 +96,23 @@ class Listing:
             return []
         return [(v, n) for v in self.views for n in self.lights if (v, n) not in self.pairs]
 
+    def choose(self, path, pairs=False, frontal=False):
+        """The pairs to read: all, checked to be a product unless `pairs`, or only the one nearest the normal.
 
-def _direction(angles, label):
+        Raises
+        ------
+        InputError
+            If there are none, a pair is there twice, or one is missing.
+        """
+        _require_whole(path, self, pairs or frontal)
+        if not frontal:
+            return self.pairs
+        # least sum of squared angles; ties go to the first in order
+        pair = min(self.pairs, key=lambda pair: pair[0][0] ** 2 + pair[1][0] ** 2)
+        return {pair: self.pairs[pair]}
+
+
+def direction(angles, label):
     """Angles in degrees, one way of writing each direction."""
     theta, phi = angles
     if not 0 <= theta <= 90:
@@ -107,8 +122,8 @@ def _direction(angles, label):
     return (theta, round(phi % 360, 6) % 360 if theta > 0 else 0.0)
 
 
-def _settings(archive, name):
-    """Check the settings of a simulated set."""
+def read_settings(archive, name):
+    """Settings of a set that btfpipe wrote, checked."""
     label = archive.label(name)
     try:
         settings = json.loads(archive.read(name))
@@ -116,6 +131,11 @@ def _settings(archive, name):
         raise InputError(f"{label}: not JSON ({error}).") from error
     if not isinstance(settings, dict):
         raise InputError(f"{label}: holds no mapping of settings.")
+    return check_settings(settings, label)
+
+
+def check_settings(settings, label):
+    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
     white, transfer = settings.get("white"), settings.get("transfer")
     density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
     for key, value in (("white", white), ("texels_per_mm", density)):
@@ -129,6 +149,18 @@ def _settings(archive, name):
     if toroidal is not None and not isinstance(toroidal, bool):
         raise InputError(f"{label}: toroidal is {toroidal!r}; expected true or false.")
     return settings
+
+
+def recognise(path):
+    """Why a folder or zip is taken for UBO2003's layout, in words, or None."""
+    names = [name for name in names_in(path) if name.lower().endswith(_ENDINGS)]
+    names = [name for name in names if parse_name(PurePosixPath(name).name) is not None]
+    if not names:
+        return None
+    return (
+        f"{len(names)} pictures have light and view angles in their names, such as"
+        f" {PurePosixPath(names[0]).name!r}"
+    )
 
 
 @contextlib.contextmanager
@@ -155,15 +187,8 @@ def open_measurement(path, *, pairs=False, frontal=False):
     """
     with open_archive(path) as archive, Decoder() as decoder:
         listing = Listing(archive)
-        _require_whole(path, archive, listing, pairs or frontal)
-        chosen = listing.pairs
-        if frontal:
-            # least sum of squared angles; ties go to the first in order
-            pair = min(chosen, key=lambda pair: pair[0][0] ** 2 + pair[1][0] ** 2)
-            chosen = {pair: chosen[pair]}
-        views = sorted({view for view, _ in chosen})
-        lights = sorted({light for _, light in chosen})
-        view_at, light_at = ({a: i for i, a in enumerate(table)} for table in (views, lights))
+        chosen = listing.choose(path, pairs, frontal)
+        lights, views, light_index, view_index = tables(chosen)
         members = list(chosen.values())
         labels = [archive.label(name) for name in members]
         mislabelled = []
@@ -185,8 +210,8 @@ def open_measurement(path, *, pairs=False, frontal=False):
             source=Path(path),
             light_directions=from_angles(*np.radians(np.array(lights).T)),
             view_directions=from_angles(*np.radians(np.array(views).T)),
-            light_index=np.array([light_at[light] for _, light in chosen], np.int32),
-            view_index=np.array([view_at[view] for view, _ in chosen], np.int32),
+            light_index=light_index,
+            view_index=view_index,
             names=labels,
             read=read,
             transfer=transfer,
@@ -197,7 +222,17 @@ def open_measurement(path, *, pairs=False, frontal=False):
         )
 
 
-def _require_whole(path, archive, listing, any_pairs):
+def tables(pairs):
+    """Sorted lights and views (lists of (theta, phi) in degrees) of (view, light) pairs, and each pair's index in them."""
+    views = sorted({view for view, _ in pairs})
+    lights = sorted({light for _, light in pairs})
+    view_at, light_at = ({a: i for i, a in enumerate(table)} for table in (views, lights))
+    light_index = np.array([light_at[light] for _, light in pairs], np.int32)
+    view_index = np.array([view_at[view] for view, _ in pairs], np.int32)
+    return lights, views, light_index, view_index
+
+
+def _require_whole(path, listing, any_pairs):
     """Refuse a listing with no pictures, a pair twice, or (unless `any_pairs`) a pair missing."""
     if not listing.pairs:
         seen = (

@@ -1,14 +1,9 @@
 """Writes UBO2003's layout, as a zip or a folder; `ubo` reads it."""
 
 import contextlib
-import json
-import shutil
-import zipfile
-from pathlib import Path
 
-from btfpipe import store
-from btfpipe.errors import InputError
-from btfpipe.formats.ubo import SETTINGS, pair_name
+from btfpipe.formats.ubo import pair_name
+from btfpipe.formats.writing import Pictures, angles_deg, create_set
 
 
 @contextlib.contextmanager
@@ -18,7 +13,7 @@ def create_measurement(path, settings):
     Parameters
     ----------
     path : path-like
-        A zip if it ends in ``.zip`` (members stored, dated with the zip's epoch), else a folder.
+        A zip if it ends in ``.zip``, else a folder; see `writing.create_set`.
     settings : dict
         For ``btfpipe.json``: white (linear value, 1 for the largest code, of a perfect white diffuser lit along the
         normal), transfer, toroidal, texels_per_mm; others are for people.
@@ -33,42 +28,43 @@ def create_measurement(path, settings):
     InputError
         If it cannot be written, or a folder of that name is there that is no such set.
     """
-    path = Path(path)
-    about = (json.dumps(settings, indent=2, default=store._plain) + "\n").encode()
-    if path.suffix.lower() == ".zip":
-        with store.whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-
-            def add(name, data):
-                info = zipfile.ZipInfo(name)
-                info.external_attr = 0o644 << 16
-                archive.writestr(info, data)
-
-            add(SETTINGS, about)
-            yield lambda number, light, view, suffix, data: add(
-                pair_name(number, light, view, suffix), data
-            )
-        return
-    if path.exists() and not (path / SETTINGS).is_file():
-        raise InputError(
-            f"{path}: is there and was not written by btfpipe (no {SETTINGS} in it); choose another --out."
+    with create_set(path, settings) as add:
+        yield lambda number, light, view, suffix, data: add(
+            pair_name(number, light, view, suffix), data
         )
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        try:
-            part.mkdir()
-            (part / SETTINGS).write_bytes(about)
 
-            def put(number, light, view, suffix, data):
-                target = part / pair_name(number, light, view, suffix)
-                target.parent.mkdir(exist_ok=True)
-                target.write_bytes(data)
 
-            yield put
-            if path.exists():
-                shutil.rmtree(path)
-            part.replace(path)
-        except OSError as error:
-            raise InputError(store._cannot_write(path, error)) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+def write_ubo(path, appearance, suffix=".jpg", *, on_progress=None, **options):
+    """Write a Sample or Model in UBO2003's layout.
+
+    Parameters
+    ----------
+    path : path-like
+        A zip if it ends in ``.zip``, else a folder.
+    appearance : Appearance
+        A product or a list of pairs.
+    suffix : str
+        ``.jpg``, ``.png`` or ``.exr``.
+    on_progress : callable, optional
+        Called with (pictures done, pictures in all).
+    **options
+        transfer, precision, quality, threads; see `writing.Pictures`.
+
+    Returns
+    -------
+    dict
+        Facts for a summary.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written; see `writing.Pictures`.
+    """
+    pictures = Pictures(appearance, suffix, **options)
+    lights = angles_deg(appearance.light_directions)
+    views = angles_deg(appearance.view_directions)
+    with create_measurement(path, pictures.settings) as put:
+        for pair, data in pictures.encoded(on_progress):
+            light, view = int(appearance.light_index[pair]), int(appearance.view_index[pair])
+            put(light * len(views) + view, lights[light], views[view], suffix, data)
+    return pictures.facts | {"format": "UBO2003"}

@@ -1,5 +1,7 @@
 """From a measurement to a Sample file, streaming: no more than a few pictures are in memory at a time."""
 
+import dataclasses
+
 import numpy as np
 
 from btfpipe import store
@@ -84,7 +86,11 @@ def ingest(
     _inside(grey_card, shape, "--grey-card", measurement)
     row, col, rows, cols = crop or (0, 0, *shape)
     texels = tuple(size or (rows, cols))
-    curve = transfer or measurement.transfer(first)
+    curve = source_curve = transfer or measurement.transfer(first)
+    clipped_in = {}
+    if measurement.correct is not None:
+        measurement = _corrected(measurement, curve, clipped_in)
+        curve, first = "linear", measurement.read(0)
     cropped = (rows, cols) != shape
     if toroidal is None:
         toroidal = bool(measurement.toroidal) and not cropped
@@ -143,7 +149,7 @@ def ingest(
         "lights": len(sample.light_directions),
         "product": sample.is_product,
         "stored_as": str(dtype),
-        "source_transfer": curve,
+        "source_transfer": source_curve,
         "white": white,
         "crop": list(crop) if crop else None,
         "source_size": list(shape),
@@ -169,6 +175,8 @@ def ingest(
             gain = drift_gain(mean / n_pairs)
             writer.array("gain", gain)
             facts["drift"] = float(gain.max() / gain.min() - 1)
+        facts["clipped_pixels"] += sum(clipped_in.values())
+        facts["clipped_pictures"] += len(clipped_in)
         facts |= _plain_facts(measurement)
         writer.facts["source"] = facts
     said = ("toroidal", "texels_per_mm", "absolute")
@@ -234,6 +242,27 @@ def _converter(source, dtype, curve, shape, texels, toroidal):
         return resized
 
     return convert
+
+
+def _corrected(measurement, curve, clipped):
+    """The measurement with linear, corrected pictures; `clipped` gets the number of clipped pixels by pair.
+
+    They are counted before the correction, over the whole picture. Eight-bit pictures become 16-bit floats, which hold
+    them well; others 32-bit ones.
+    """
+
+    def read(pair):
+        picture = measurement.read(pair)
+        full = _FULL.get(picture.dtype)
+        if full and picture.max() == full:
+            clipped[pair] = _count_clipped(picture, full)
+        linear = decode(picture / (full or 1), curve).astype(np.float32)
+        dtype = np.float16 if picture.dtype == np.uint8 else np.float32
+        return measurement.correct(pair, linear).astype(dtype)
+
+    return dataclasses.replace(
+        measurement, read=read, transfer=lambda picture: "linear", correct=None
+    )
 
 
 def _count_clipped(picture, full):

@@ -25,6 +25,9 @@ class Measurement:
         several threads at once.
     transfer : callable
         ``transfer(picture)`` gives the transfer curve that the format means for a picture read.
+    correct : callable or None
+        ``correct(pair, picture)`` gives a linear picture (rows, cols, 3) float32 as it would be under one distant light,
+        where the source's lamp stood near. The Sample then holds floating-point values.
     white : float or None
         Decoded value that stands for a perfect white diffuser lit at normal incidence.
     toroidal : bool or None
@@ -42,6 +45,7 @@ class Measurement:
     names: list
     read: Callable
     transfer: Callable
+    correct: Callable | None = None
     white: float | None = None
     toroidal: bool | None = None
     texels_per_mm: float | None = None

@@ -35,6 +35,21 @@ def test_only_the_keyed_angles_count(keys, separator, upper, prefix):
 
 @pytest.mark.parametrize(
     "name",
+    [
+        "img_tv30_pv270_tl15_pl0.jpg",
+        "TL015_PL000_TV030_PV270.EXR",
+        "tl_15 pl_0 tv_30 pv_270.png",
+        "wool tl=15.0, pl=0, tv=30, pv=270.jpg",
+        "PV270PL000TL015TV030.HDR",
+        "tv030.000_pv270.000_tl015.000_pl-0.000.exr",
+    ],
+)
+def test_names_that_others_use_are_read(name):
+    assert ubo.parse_name(name) == ((15, 0), (30, 270))
+
+
+@pytest.mark.parametrize(
+    "name",
     ["00012.jpg", "tl000 pl000 tv000.jpg", "tl000 pl000 tv000 pv000 tl015.jpg", "total 0.jpg"],
 )
 def test_a_name_without_each_key_once_is_no_pair(name):

@@ -1,0 +1,414 @@
+"""Pictures of any names beside a list of their directions, as CSV or JSON: the layout for home-made and sparse captures.
+
+The list has a row a picture: ``name``, relative to the list, and one of three sets of columns (`COLUMNS`): angles in degrees;
+vectors to the light and to the eye; or positions of lamp and camera in cm, from the middle of the patch with x to the right, y
+up the picture and z along the normal. Other columns are left alone. CSV is comma-, semicolon- or tab-separated with a header;
+JSON is a list of objects, or an object with that list as ``pairs``. Settings (white, transfer, toroidal, texels_per_mm,
+patch_cm) stand in that object, or in ``btfpipe.json`` beside the list.
+
+From positions the pictures, which must be frontal ones of the patch alone, are brought to one distant light a pair, the one in
+the direction of the lamp from the patch's middle: see `correction`. Views are the camera's direction from there. How
+far true directions stray from these over the patch is reported.
+"""
+
+import contextlib
+import csv
+import io
+import json
+import math
+from collections import namedtuple
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from btfpipe.directions import from_angles
+from btfpipe.errors import InputError
+from btfpipe.formats import ubo
+from btfpipe.formats.archive import is_zip, open_archive
+from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.formats.writing import Pictures, create_set
+from btfpipe.sample.measurement import Measurement
+
+COLUMNS = {
+    "angles": ("theta_l", "phi_l", "theta_v", "phi_v"),
+    "vectors": ("lx", "ly", "lz", "vx", "vy", "vz"),
+    "positions": ("lamp_x", "lamp_y", "lamp_z", "camera_x", "camera_y", "camera_z"),
+}
+LIST = "directions.csv"
+_ENDINGS = (".csv", ".json")
+_MOST_LIST = 1 << 24  # bytes
+
+# A list as read: member, which of COLUMNS it has, names of pictures, numbers (pairs, 4 or 6), settings.
+_List = namedtuple("_List", "member kind names numbers settings")
+
+
+def recognise(path):
+    """Why a list, or a folder or zip with one, is taken for pictures with directions, in words, or None."""
+    try:
+        source, wanted = _source(path, None)
+        if not (source.is_dir() or is_zip(source)):
+            return None
+        with open_archive(source) as archive:
+            found = _find(archive, wanted)
+    except (InputError, OSError):
+        return None
+    if len(found) != 1:
+        return None
+    return f"{found[0].member} lists {len(found[0].names)} pictures with {found[0].kind}"
+
+
+@contextlib.contextmanager
+def open_measurement(path, *, listing=None, patch_cm=None):
+    """Open pictures with a list of their directions.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder or zip that holds one such list, or the list itself.
+    listing : str, optional
+        Which list, by its name in the folder or zip; needed where there are several.
+    patch_cm : (float, float), optional
+        Height and width of the patch that the pictures show; needed with positions, unless settings say it.
+
+    Yields
+    ------
+    Measurement
+        A product of views and lights in its order, if the pairs are one; else the pairs in the list's order.
+
+    Raises
+    ------
+    InputError
+        If there is no list, or one with wrong numbers, pictures that are not there, or a pair twice.
+    """
+    source, wanted = _source(path, listing)
+    with open_archive(source) as archive, Decoder() as decoder:
+        found = _find(archive, wanted, strict=True)
+        if len(found) != 1:
+            several = ", ".join(f.member for f in found) or "none"
+            raise InputError(
+                f"{path}: expected one .csv or .json that lists names of pictures and their directions; found"
+                f" {several}."
+            )
+        listed = found[0]
+        label = archive.label(listed.member)
+        settings = _settings(archive, listed, label)
+        members = _members(archive, listed, label)
+        lights, views = _directions(listed, label)
+        facts = {
+            "format": f"pairs ({listed.kind})",
+            "strays": sorted({*archive.names} - {*members, listed.member}),
+            "mislabelled": [],
+        }
+        lamps = None
+        if listed.kind == "positions":
+            patch_cm = patch_cm or settings.get("patch_cm")
+            lamps, cameras = listed.numbers[:, :3], listed.numbers[:, 3:]
+            if patch_cm is None:
+                raise InputError(
+                    f"{label}: positions need the patch's height and width in cm: give --patch-cm, or patch_cm in"
+                    f" {ubo.SETTINGS}."
+                )
+            reference = float(np.median(np.linalg.norm(lamps, axis=1)))
+            facts |= _spread(lamps, cameras, patch_cm, reference)
+        order, tables = _arrange(lights, views, listed.names, label)
+        members = [members[i] for i in order]
+        labels = [archive.label(name) for name in members]
+
+        def read(pair):
+            picture = decoder.decode(archive.read(members[pair]), labels[pair])
+            if is_mislabelled(members[pair], picture.suffix):
+                facts["mislabelled"].append(members[pair])
+            return colours(picture, labels[pair])
+
+        def correct(pair, picture):
+            lamp = lamps[order[pair]]
+            return picture * correction(picture.shape[:2], patch_cm, lamp, reference)[..., None]
+
+        def transfer(picture):
+            return "linear" if picture.dtype.kind == "f" else settings.get("transfer") or "srgb"
+
+        yield Measurement(
+            source=Path(path),
+            names=labels,
+            read=read,
+            transfer=transfer,
+            correct=correct if lamps is not None else None,
+            white=settings.get("white"),
+            toroidal=settings.get("toroidal"),
+            texels_per_mm=settings.get("texels_per_mm"),
+            facts=facts,
+            **tables,
+        )
+
+
+def correction(shape, patch_cm, lamp, reference):
+    """What to multiply a linear picture by, so that a near lamp lights it like a distant one.
+
+    A small lamp lights the texel at distance d from it with an irradiance of ``cos / d^2 = z / d^3``. The factor brings
+    each texel to the irradiance of the patch's middle, cosine included (d / d_0)^3, and that to the `reference` distance,
+    (d_0 / reference)^2, so that all pairs share one light.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and cols of the picture.
+    patch_cm : (float, float)
+        Height and width that it shows.
+    lamp : (3,)
+        Position in cm.
+    reference : float
+        Distance in cm.
+
+    Returns
+    -------
+    (rows, cols) float32
+    """
+    rows, cols = shape
+    y = (0.5 - (np.arange(rows) + 0.5) / rows) * patch_cm[0]
+    x = ((np.arange(cols) + 0.5) / cols - 0.5) * patch_cm[1]
+    square = (lamp[0] - x) ** 2 + (lamp[1] - y[:, None]) ** 2 + lamp[2] ** 2
+    middle = float(np.dot(lamp, lamp))
+    return ((square / middle) ** 1.5 * (middle / reference**2)).astype(np.float32)
+
+
+def _spread(lamps, cameras, patch_cm, reference):
+    """How far directions stray from those of the patch's middle, and how much is corrected."""
+    height, width = patch_cm
+    corners = np.array([[x * width / 2, y * height / 2, 0] for x in (-1, 1) for y in (-1, 1)])
+    facts = {}
+    for name, positions in (("light", lamps), ("view", cameras)):
+        to = positions[:, None] - corners
+        cosine = np.einsum("pcd,pd->pc", to, positions)
+        cosine /= np.linalg.norm(to, axis=2) * np.linalg.norm(positions, axis=1)[:, None]
+        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).max(axis=1)
+        facts[f"{name}_spread_deg"] = float(angle.max())
+        facts[f"median_{name}_spread_deg"] = float(np.median(angle))
+    distance = np.linalg.norm(lamps, axis=1)
+    across = (np.linalg.norm(lamps[:, None] - corners, axis=2) / distance[:, None]) ** 3
+    facts |= {
+        "patch_cm": (float(height), float(width)),
+        "lamp_distance_cm": (float(distance.min()), float(distance.max())),
+        "reference_distance_cm": reference,
+        "correction_over_patch": (float(across.min()), float(across.max())),
+    }
+    return facts
+
+
+def _source(path, listing):
+    """Folder or zip to open, and the name of the list in it, if known."""
+    path = Path(path)
+    if path.suffix.lower() in _ENDINGS and not path.is_dir():
+        return path.parent, path.name
+    return path, listing
+
+
+def _find(archive, wanted, strict=False):
+    """Lists in an archive. If `strict`, the `wanted` one must be good, and what is wrong with a likely one is told."""
+    if wanted is not None and wanted not in archive.names:
+        raise InputError(f"{archive.path}: holds no {wanted}; expected a list of pictures.")
+    names = [wanted] if wanted is not None else archive.names
+    found = []
+    for name in names:
+        base = PurePosixPath(name).name
+        likely = base.lower().endswith(_ENDINGS) and base != ubo.SETTINGS
+        if wanted is None and (not likely or base.startswith(".") or "__MACOSX/" in name):
+            continue
+        listed = _read_list(archive, name, strict, wanted is not None)
+        if listed is not None:
+            found.append(listed)
+    return found
+
+
+def _read_list(archive, name, strict, wanted):
+    """One list, or None for what is none; wrong numbers in a list raise if `strict`."""
+    label = archive.label(name)
+    try:
+        if archive.size(name) > _MOST_LIST:
+            raise InputError(
+                f"{label}: longer than {_MOST_LIST} bytes; expected a list of pictures."
+            )
+        try:
+            text = archive.read(name).decode("utf-8-sig")
+            rows, settings = (_json if name.lower().endswith(".json") else _csv)(text)
+        except (ValueError, csv.Error, RecursionError) as error:
+            raise InputError(f"{label}: not a list of pictures ({error}).") from error
+        kind = next(
+            (k for k, c in COLUMNS.items() if rows and {"name", *c} <= rows[0].keys()), None
+        )
+        if kind is None:
+            columns = "; ".join(", ".join(c) for c in COLUMNS.values())
+            raise InputError(
+                f"{label}: not a list of pictures; expected the columns name and one of: {columns}."
+            )
+    except InputError:
+        if wanted and strict:
+            raise
+        return None
+    names, numbers = [], []
+    for number, row in enumerate(rows, 1):
+        picture, values = row.get("name"), [_number(row.get(c)) for c in COLUMNS[kind]]
+        if not isinstance(picture, str) or not picture.strip() or not np.isfinite(values).all():
+            if not strict:
+                return None
+            raise InputError(
+                f"{label}: picture {number} ({picture!r}) needs a number for each of"
+                f" {', '.join(COLUMNS[kind])}."
+            )
+        names.append(picture.strip())
+        numbers.append(values)
+    return _List(name, kind, names, np.array(numbers), settings)
+
+
+def _csv(text):
+    """Rows of a CSV as dicts with lower-case keys; and settings, of which there are none."""
+    head = text.lstrip().partition("\n")[0]
+    delimiter = next((d for d in ",;\t" if d in head), ",")
+    rows = csv.reader(io.StringIO(text.lstrip()), delimiter=delimiter, skipinitialspace=True)
+    header = [cell.strip().lower() for cell in next(rows, [])]
+    if len(set(header)) != len(header):
+        raise ValueError("a column comes twice")
+    rows = [row + [""] * (len(header) - len(row)) for row in rows if any(row)]
+    return [dict(zip(header, row, strict=False)) for row in rows], {}
+
+
+def _json(text):
+    """Rows and settings of a JSON list."""
+    whole = json.loads(text)
+    rows = whole.get("pairs") if isinstance(whole, dict) else whole
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError("expected a list of objects, or an object with that as 'pairs'")
+    settings = {k: v for k, v in whole.items() if k != "pairs"} if isinstance(whole, dict) else {}
+    return [{key.lower(): value for key, value in row.items()} for row in rows], settings
+
+
+def _number(value):
+    """A number from a cell, NaN if it is none."""
+    try:
+        return float(value) if not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _settings(archive, listed, label):
+    """Settings from the list and from ``btfpipe.json`` beside it; the list's go first."""
+    beside = (PurePosixPath(listed.member).parent / ubo.SETTINGS).as_posix()
+    settings = ubo.read_settings(archive, beside) if beside in archive.names else {}
+    settings |= ubo.check_settings(listed.settings, label)
+    size = settings.get("patch_cm")
+    if size is not None:
+        good = isinstance(size, list) and len(size) == 2 and all(0 < _number(s) < 1e6 for s in size)
+        if not good:
+            raise InputError(
+                f"{label}: patch_cm is {size!r}; expected the patch's height and width in cm."
+            )
+        settings["patch_cm"] = [float(s) for s in size]
+    return settings
+
+
+def _members(archive, listed, label):
+    """Members of the archive that the list names."""
+    folder, there = PurePosixPath(listed.member).parent, set(archive.names)
+    members = [(folder / name.replace("\\", "/")).as_posix() for name in listed.names]
+    lost = [name for name, member in zip(listed.names, members, strict=True) if member not in there]
+    if lost:
+        raise InputError(
+            f"{label}: {len(lost)} of {len(members)} pictures are not there (first: {lost[0]!r}); names are relative"
+            " to the list."
+        )
+    if len(set(members)) != len(members):
+        twice = next(name for i, name in enumerate(members) if name in members[:i])
+        raise InputError(f"{label}: lists {twice!r} twice.")
+    return members
+
+
+def _directions(listed, label):
+    """Unit vectors (pairs, 3) to light and eye."""
+    numbers = listed.numbers
+    if listed.kind == "angles":
+        angles = [[ubo.direction(row[i : i + 2], label) for row in numbers] for i in (0, 2)]
+        return [from_angles(*np.radians(a).T) for a in angles]
+    vectors = []
+    for what, part in (("light", numbers[:, :3]), ("view", numbers[:, 3:])):
+        length = np.linalg.norm(part, axis=1)
+        bad = np.flatnonzero(~((length > 1e-9) & (length < 1e12) & (part[:, 2] >= 0)))
+        if listed.kind == "positions":
+            bad = np.union1d(bad, np.flatnonzero(part[:, 2] <= 0))
+        if len(bad):
+            raise InputError(
+                f"{label}: the {what} of {listed.names[bad[0]]!r} is at {part[bad[0]].tolist()}; expected one above"
+                " the surface (z positive)."
+            )
+        vectors.append(part / length[:, None])
+    return vectors
+
+
+def _arrange(lights, views, names, label):
+    """Order of the pairs, and the tables of a `Measurement`: directions once each, as they come first."""
+    tables, index = [], []
+    for directions in (lights, views):
+        at, table, where = {}, [], []
+        for direction in directions:
+            key = tuple(np.round(direction, 9) + 0.0)
+            if key not in at:
+                at[key] = len(table)
+                table.append(direction)
+            where.append(at[key])
+        tables.append(np.array(table))
+        index.append(np.array(where, np.int32))
+    number = index[1].astype(np.int64) * len(tables[0]) + index[0]
+    order = np.argsort(number, kind="stable")
+    same = np.flatnonzero(np.diff(number[order]) == 0)
+    if len(same):
+        first, second = (names[i] for i in order[same[0] : same[0] + 2])
+        raise InputError(
+            f"{label}: {len(same)} pairs are there twice (first: {first!r} and {second!r}); remove one of each."
+        )
+    if len(number) != len(tables[0]) * len(tables[1]):
+        order = np.arange(len(number))
+    return order, {
+        "light_directions": tables[0],
+        "view_directions": tables[1],
+        "light_index": index[0][order],
+        "view_index": index[1][order],
+    }
+
+
+def write_pairs(path, appearance, suffix=".exr", *, on_progress=None, **options):
+    """Write pictures with a CSV of their directions.
+
+    Parameters
+    ----------
+    path : path-like
+        A zip if it ends in ``.zip``, else a folder.
+    appearance : Appearance
+        A product or a list of pairs.
+    suffix : str
+        ``.exr``, ``.png`` or ``.jpg``.
+    on_progress : callable, optional
+        Called with (pictures done, pictures in all).
+    **options
+        transfer, precision, quality, threads; see `writing.Pictures`.
+
+    Returns
+    -------
+    dict
+        Facts for a summary.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written; see `writing.Pictures`.
+    """
+    pictures = Pictures(appearance, suffix, **options)
+    lights = appearance.light_directions[appearance.light_index]
+    views = appearance.view_directions[appearance.view_index]
+    digits = len(str(appearance.n_pairs - 1))
+    names = [f"{pair:0{digits}d}{suffix}" for pair in range(appearance.n_pairs)]
+    text = ",".join(("name", *COLUMNS["vectors"])) + "\n"
+    for name, light, view in zip(names, lights, views, strict=True):
+        text += ",".join((name, *(repr(float(x)) for x in (*light, *view)))) + "\n"
+    with create_set(path, pictures.settings) as add:
+        add(LIST, text.encode())
+        for pair, data in pictures.encoded(on_progress):
+            add(names[pair], data)
+    return pictures.facts | {"format": "pairs"}

@@ -1,0 +1,56 @@
+"""`recognise` of every format, in the order in which `ingest` should ask."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from btfpipe.directions import bonn81
+from btfpipe.formats import pairs, pictures, ptm, rti, ubo, utia
+from btfpipe.formats.images import write_picture
+from btfpipe.formats.pairs import write_pairs
+from btfpipe.formats.rti import write_lp
+from btfpipe.formats.ubo_writing import write_ubo
+from btfpipe.formats.utia import write_utia
+
+FORMATS = [ptm, rti, pairs, utia, ubo, pictures]
+STARTS = [b"", b"PK\3\4", b"PK\5\6", b"#?", b"PTM_1.", b"#HSH", b"2\na 0 0 1\n", b"name,lx\n", b"[{", b"\x93NUMPY"]  # fmt: skip
+
+
+def first(path):
+    return next((f for f in FORMATS if f.recognise(path)), None)
+
+
+@pytest.mark.parametrize(
+    ("write", "expected"),
+    [(write_ubo, ubo), (write_utia, utia), (write_lp, rti), (write_pairs, pairs)],
+)
+@pytest.mark.parametrize("target", ["set", "set.zip"])
+def test_what_was_written_is_recognised_as_that(tmp_path, make_sample, write, expected, target):
+    sample = make_sample(3, 4, lights=bonn81()[:3], views=bonn81()[:2])
+    write(tmp_path / target, sample, ".png")
+    assert first(tmp_path / target) is expected
+
+
+def test_a_picture_is_one_whatever_its_name(tmp_path):
+    write_picture(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
+    (tmp_path / "a.png").rename(tmp_path / "a.lp")
+    assert first(tmp_path / "a.lp") is pictures
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.sampled_from(STARTS), st.binary(max_size=60),
+    st.sampled_from(["a.zip", "a.lp", "a.csv", "a.json", "a.ptm", "a", "btfpipe.json"]),
+)  # fmt: skip
+def test_no_file_however_strange_makes_it_raise(tmp_path_factory, start, rest, name):
+    folder = tmp_path_factory.mktemp("strange")
+    (folder / name).write_bytes(start + rest)
+    with zipfile.ZipFile(folder / "b.zip", "w") as archive:
+        archive.writestr(name, start + rest)
+    for path in (folder / name, folder, folder / "b.zip", folder / "nothing"):
+        for module in FORMATS:
+            reason = module.recognise(path)
+            assert reason is None or isinstance(reason, str)
