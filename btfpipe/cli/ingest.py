@@ -28,10 +28,18 @@ class Size(click.ParamType):
 
 
 _POSITIVE = FiniteFloat(min=0, min_open=True)
+# As in btfpipe.formats.sources, which is not imported for --help.
+_FORMATS = ("btf", "ptm", "rti", "pairs", "utia", "ubo", "curet", "picture")
 
 
 @click.command()
 @click.argument("source", type=input_file())
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(_FORMATS),
+    help="Take SOURCE for this format.  [default: told by looking]",
+)
 @click.option(
     "--pairs", is_flag=True, help="Keep pairs that are no product of views and lights, as a list."
 )
@@ -39,6 +47,29 @@ _POSITIVE = FiniteFloat(min=0, min_open=True)
     "--frontal",
     is_flag=True,
     help="Keep only the pair whose light and view are nearest the normal.",
+)
+@click.option(
+    "--directions",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="UTIA's list of directions, with the shifted lights of coincident pairs.",
+)
+@click.option(
+    "--colour",
+    type=click.Choice(["xyz", "rgb"]),
+    help="Of floating-point pictures in UTIA's layout.  [default: xyz]",
+)
+@click.option("--listing", help="Which list of directions to take, where SOURCE holds several.")
+@click.option(
+    "--patch-cm",
+    type=_POSITIVE,
+    nargs=2,
+    metavar="HEIGHT WIDTH",
+    help="Size of the patch, for lists of lamp and camera positions.",
+)
+@click.option(
+    "--sample-number",
+    type=click.IntRange(1, 61),
+    help="Of a CUReT set, for its radiometry.  [default: from names]",
 )
 @click.option(
     "--crop",
@@ -81,69 +112,88 @@ _POSITIVE = FiniteFloat(min=0, min_open=True)
 )
 @click.option("--texels-per-mm", type=_POSITIVE, help="Of the pictures in SOURCE.")
 @stage()
-def ingest(
-    source,
-    out,
-    threads,
-    quiet,
-    pairs,
-    frontal,
-    crop,
-    size,
-    transfer,
-    white,
-    grey_card,
-    grey_card_reflectance,
-    flatten,
-    toroidal,
-    texels_per_mm,
-):
-    """Bring a measurement in: make a Sample of SOURCE.
+def ingest(source, format_, out, threads, quiet, **options):
+    """Bring a measurement in: make a Sample of SOURCE, or a Model if it is compressed already.
 
-    SOURCE is a zip or folder in the layout of Bonn's UBO2003 sets (one picture a pair of light and view, angles in the
-    names), or one plain picture, which becomes a BTF of one view and one light.
+    SOURCE is a zip or folder of pictures: in the layout of Bonn's UBO2003 and ATRIUM sets or of UTIA's (angles in the names),
+    CUReT's, an RTI set with its .lp, or any with a CSV or JSON list of directions; one plain picture, which becomes a BTF of
+    one view and one light; or a file of Bonn's .btf family, a .ptm or a .rti.
 
     \b
     Example:
         btfpipe ingest UBO_CORDUROY256.zip --crop 0 0 128 128 -o corduroy.sample.npz
         btfpipe ingest bricks.png --toroidal -o bricks.sample.npz
-    """  # fmt: skip
+        btfpipe ingest carpet01_W400xH400_L151xV151.btf -o carpet.model.npz
+    """
+    from btfpipe.compression.model import Model
+    from btfpipe.formats import sources
     from btfpipe.sample.ingest import ingest as ingest_measurement
 
-    if (grey_card is None) != (grey_card_reflectance is None):
+    if (options["grey_card"] is None) != (options["grey_card_reflectance"] is None):
         raise click.UsageError("--grey-card and --grey-card-reflectance go together.")
-    if grey_card is not None and white is not None:
+    if options["grey_card"] is not None and options["white"] is not None:
         raise click.UsageError("--grey-card and --white are two ways to say the same; give one.")
-    with _open(source, pairs, frontal) as measurement, progress("pictures", quiet) as report:
-        facts = ingest_measurement(
-            measurement,
-            out,
-            crop=crop,
-            size=size,
-            transfer=transfer,
-            white=white,
-            grey_card=grey_card,
-            grey_card_reflectance=grey_card_reflectance,
-            flatten=flatten,
-            toroidal=toroidal,
-            texels_per_mm=texels_per_mm,
-            threads=threads,
-            report=report,
-            about={"name": Path(source).name, "digest": store.digest(source)},
-        )
-    return {"inputs": [source], **facts}
-
-
-def _open(source, pairs, frontal):
-    """The reader for a source: a set of pictures, or one."""
-    from btfpipe.formats import pictures, ubo
-    from btfpipe.formats.archive import is_zip
-
     if not source.is_dir() and store.is_ours(source):
         raise InputError(
             f"{source}: already a {store.read(source).kind} of btfpipe's; expected a foreign measurement or a"
             f" picture. `btfpipe info {source}` describes it."
         )
-    if source.is_dir() or is_zip(source):
-        return ubo.open_measurement(source, pairs=pairs, frontal=frontal)
-    return pictures.open_measurement(source)
+    name, reason = (format_, "--format says so") if format_ else sources.recognise(source)
+    own = {key: options.pop(key) for key in _OF_FORMATS}
+    takes = sources.FORMATS[name].options
+    if "transfer" in takes:
+        own["transfer"] = options.pop("transfer")
+    own = {key: value for key, value in own.items() if value not in (None, False)}
+    for key in own:
+        if key not in takes:
+            raise click.UsageError(
+                f"{_flag(key)} is not for {name}, which {source} is taken for ({reason})."
+            )
+    about = {"name": Path(source).name, "digest": store.digest(source)}
+    told = {"inputs": [source], "taken_for": name, "because": reason}
+    opened = sources.open_source(source, name, **own)
+    if isinstance(opened, Model):
+        given = [key for key, value in options.items() if value not in (None, False)]
+        if given:
+            raise click.UsageError(
+                f"{source} is compressed already and is kept as it is; {_flag(given[0])} is for pictures."
+            )
+        opened.about |= about
+        opened.save(out)
+        return told | _facts_of(opened)
+    with opened as measurement, progress("pictures", quiet) as report:
+        facts = ingest_measurement(
+            measurement, out, threads=threads, report=report, about=about, **options
+        )
+    if not quiet:
+        for warning in facts.get("warnings", []):
+            click.echo(f"Warning: {warning}.", err=True)
+    return told | facts
+
+
+# Options that some formats take and others do not.
+_OF_FORMATS = (
+    "pairs", "frontal", "directions", "colour", "listing", "patch_cm", "sample_number",
+)  # fmt: skip
+
+
+def _flag(name):
+    return "--" + name.replace("_", "-")
+
+
+def _facts_of(model):
+    """What a summary says of a Model that came from a file."""
+    return {
+        "kind": "model",
+        "method": model.method,
+        "rows": model.shape[0],
+        "cols": model.shape[1],
+        "pairs": model.n_pairs,
+        "views": len(model.view_directions),
+        "lights": len(model.light_directions),
+        "product": model.is_product,
+        "toroidal": model.toroidal,
+        "texels_per_mm": model.texels_per_mm,
+        "absolute": model.absolute,
+        "nbytes": model.nbytes,
+    }

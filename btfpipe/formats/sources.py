@@ -2,8 +2,9 @@
 
 import importlib
 from collections import namedtuple
+from pathlib import Path
 
-from btfpipe.errors import InputError
+from btfpipe.formats.archive import is_zip
 
 # A format that can be read. `module` holds recognise(path), which gives a reason in words or None, and `opener`: a context manager that
 # yields a Measurement, or gives a Model. `options`: the opener's arguments that a user may set.
@@ -11,14 +12,13 @@ Format = namedtuple("Format", "module opener options")
 
 # In the order of asking: the particular before the general.
 FORMATS = {
-    "ptm": Format("btfpipe.formats.ptm", "read_model", ()),
+    "ptm": Format("btfpipe.formats.ptm", "read_model", ("transfer",)),
     "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
     "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),
     "utia": Format(
         "btfpipe.formats.utia", "open_measurement", ("pairs", "frontal", "directions", "colour")
     ),
     "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs", "frontal")),
-    "curet": Format("btfpipe.formats.curet", "open_measurement", ("sample_number",)),
     "picture": Format("btfpipe.formats.pictures", "open_measurement", ()),
 }
 
@@ -26,19 +26,14 @@ FORMATS = {
 def recognise(path):
     """The format of a file, folder or zip, and why: (str, str).
 
-    Raises
-    ------
-    InputError
-        If it is none of those in `FORMATS`.
+    What nothing recognises is taken for the most general format of its kind, whose reader says what is wrong with it.
     """
     for name, format_ in FORMATS.items():
         reason = importlib.import_module(format_.module).recognise(path)
         if reason:
             return name, reason
-    raise InputError(
-        f"{path}: of no format that btfpipe reads ({', '.join(FORMATS)}). `btfpipe info {path}` says what it finds;"
-        " --format takes it for one all the same."
-    )
+    general = "ubo" if Path(path).is_dir() or is_zip(path) else "picture"
+    return general, "no format fits"
 
 
 def open_source(path, name, **options):
