@@ -12,6 +12,7 @@ STAGES = {
     "info": "Say what any file is and what is wrong with it.",
     "compress": "Make a Model that stands for a Sample.",
     "compare": "Measure how far a Model is from a Sample.",
+    "export": "Write a Sample or Model in a format that others read.",
     "textons": "Extract surface textons and neighbour lists.",
     "surface": "Prepare a mesh for synthesis.",
     "synthesize": "Grow a Sample over a surface or a plane.",

@@ -1,0 +1,56 @@
+"""`btfpipe export`: a Sample or a Model in a format that others read."""
+
+import click
+
+from btfpipe.cli.options import input_file, naming, progress, stage
+
+# As in btfpipe.formats.targets, which is not imported for --help.
+_FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
+
+
+@click.command()
+@click.argument("source", type=input_file())
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(_FORMATS),
+    help="What to write.  [default: btf if the name ends so, else ubo]",
+)
+@click.option(
+    "--suffix",
+    type=click.Choice([".jpg", ".png", ".exr", ".bmp", ".bmp.Z"]),
+    help="Kind of the pictures.  [default: .jpg for ubo and rti, .png for utia, .exr for pairs, .bmp.Z for curet]",
+)
+@click.option(
+    "--sample-number",
+    type=click.IntRange(1, 61),
+    help="Of a CUReT set: names its files, and decides on the lamp.  [default: 1]",
+)
+@stage(folder=True)
+def export(source, format_, suffix, sample_number, out, threads, quiet):
+    """Write SOURCE, a Sample or a Model, in a format that other programs read.
+
+    Sets of pictures become a zip if the name ends in .zip, else a folder: ubo (Bonn's layout), utia, pairs (any pairs, with a CSV
+    of directions), rti (one view, with an .lp), curet (the 205 views that CUReT's robot would show, unrectified). btf is Bonn's
+    factorised file.
+
+    \b
+    Example:
+      btfpipe export wool.sample.npz --format utia -o wool_utia.zip
+      btfpipe export wool.model.npz -o wool.btf
+    """
+    from btfpipe.compression import open_appearance
+    from btfpipe.formats import targets
+
+    format_ = format_ or ("btf" if out.suffix.lower() == ".btf" else "ubo")
+    options = {"suffix": suffix, "sample_number": sample_number}
+    options = {name: value for name, value in options.items() if value is not None}
+    for name in options:
+        if name not in targets.WRITERS[format_].options:
+            raise click.UsageError(f"--{name.replace('_', '-')} is not for {format_}.")
+    appearance = open_appearance(source)
+    with naming(source), progress("export: pictures", quiet) as report:
+        facts = targets.write(
+            out, format_, appearance, threads=threads, on_progress=report, **options
+        )
+    return {"inputs": [source], "format": format_, **(facts or {})}

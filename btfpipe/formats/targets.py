@@ -1,0 +1,28 @@
+"""What can be written, in one table."""
+
+import importlib
+from collections import namedtuple
+
+# A format that can be written: where its function is, function(path, appearance, *, threads, on_progress, **options), and which options
+# a user may set.
+Writer = namedtuple("Writer", "module function options")
+
+WRITERS = {
+    "ubo": Writer("btfpipe.formats.ubo_writing", "write_ubo", ("suffix",)),
+    "utia": Writer("btfpipe.formats.utia", "write_utia", ("suffix",)),
+    "rti": Writer("btfpipe.formats.rti", "write_lp", ("suffix",)),
+    "pairs": Writer("btfpipe.formats.pairs", "write_pairs", ("suffix",)),
+}
+
+
+def write(path, name, appearance, *, threads=1, on_progress=None, **options):
+    """Write an Appearance in the named format; returns facts for a summary.
+
+    Raises
+    ------
+    InputError
+        As the format's function.
+    """
+    writer = WRITERS[name]
+    function = getattr(importlib.import_module(writer.module), writer.function)
+    return function(path, appearance, threads=threads, on_progress=on_progress, **options)
