@@ -33,6 +33,7 @@ from btfpipe.formats.compress_z import MAGIC, decompress
 from btfpipe.formats.curet_geometry import LARGEST_SHIFT, find_shifts, fit, outline, resample
 from btfpipe.formats.curet_writing import write_curet
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.formats.ubo import parse_name
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.measurement import Measurement
 
@@ -48,6 +49,7 @@ _CALIBRATIONS = {"ccal.dat": 6, "acal.dat": 2}  # numbers a sample; the first fo
 _MARGIN = 0.9  # of the sample's shorter side, kept by default
 _HEADER = 54
 _MAX_PICTURE = 2**28
+_PADDING = 4096  # bytes after the pixels, which some writers leave
 _SAMPLES = 61
 
 
@@ -85,7 +87,7 @@ class Listing:
             path = PurePosixPath(COPY.sub("", name))
             base, parts = path.name, path.parts[:-1]
             hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
-            stem = _stem(base)
+            stem = _stem(base) if parse_name(base) is None else None
             numbers = re.findall(r"\d+", stem) if stem is not None else []
             if hidden or not numbers:
                 if base.lower() in _CALIBRATIONS and not hidden:
@@ -125,10 +127,14 @@ def recognise(path):
     path = Path(path)
     if not path.is_dir() and not is_zip(path):
         return None
-    with open_archive(path) as archive:
-        listing = Listing(archive)
+    try:
+        with open_archive(path) as archive:
+            listing = Listing(archive)
+    except InputError:
+        return None  # whoever opens it says what is wrong
     count = len(listing.pictures)
-    if count == 0:
+    # a table of directions beside the pictures belongs to another format
+    if count == 0 or any(name.lower().endswith((".lp", ".csv")) for name in listing.strays):
         return None
     if listing.typical >= max(1, count // 2):
         first = next(iter(listing.pictures.values()))
@@ -295,7 +301,7 @@ def unpack_bmp(data, label):
     head = decompress(data, _HEADER, label, start_only=True)
     if len(head) < _HEADER or head[:2] != b"BM":
         raise InputError(f"{label}: truncated, or no BMP inside (starts with {head[:2]!r}).")
-    declared, start = struct.unpack_from("<I4xI", head, 2)
+    (start,) = struct.unpack_from("<I", head, 10)
     cols, rows, _, bits = struct.unpack_from("<iiHH", head, 18)
     needed = start + (abs(cols) * bits + 31) // 32 * 4 * abs(rows)
     if not 0 < needed <= _MAX_PICTURE:
@@ -303,9 +309,7 @@ def unpack_bmp(data, label):
             f"{label}: declares {abs(rows)} x {abs(cols)} pixels of {bits} bits; expected a picture of at most"
             f" {_MAX_PICTURE} bytes."
         )
-    # some writers pad the end
-    limit = declared if needed <= declared <= needed + 4096 else needed + 4
-    whole = decompress(data, limit, label)
+    whole = decompress(data, needed + _PADDING, label)
     if len(whole) < needed:
         raise InputError(
             f"{label}: truncated; holds {len(whole)} of {needed} bytes. Fetch it again."
@@ -389,13 +393,14 @@ def _rectifier(path, load, used, names, pairs, size, centre, side, register, gai
         "sample_rows_pixels": geometry.sides[0] if geometry.sides else None,
         "sample_cols_pixels": geometry.sides[1] if geometry.sides else None,
         "surface_height_pixels": geometry.height,
-        "camera_scale": dict(enumerate(geometry.camera_scale[1:].tolist(), 1)),
+        "camera_scale": {str(k): float(geometry.camera_scale[k]) for k in range(1, 8)},
         "outlines": geometry.outlines,
         "shear": geometry.shear,
         "patch_side_pixels": float(side),
         "registered": int(registered.sum()),
         "largest_shift_pixels": float(np.linalg.norm(shifts, axis=1).max()),
-        "shifts": {n: tuple(q) for n, q in zip(used, shifts.tolist(), strict=True)},
+        "rms_shift_pixels": float(np.sqrt((shifts**2).sum(axis=1).mean())),
+        "shifts": [[n, *q] for n, q in zip(used, shifts.tolist(), strict=True)],
         "source_clipped_pixels": sum(clipped),
     }
     return read, facts

@@ -155,8 +155,15 @@ def _project(values, affine, finer, out):
     """Draw a patch (rows, cols, 3) into a picture of zeros, through the affine map from picture to patch."""
     rows, cols = values.shape[0], values.shape[1]
     share = np.float32(1.0 / (finer * finer))
+    # how far from its middle a pixel reaches, in texels
+    high = 0.5 + 0.5 * (abs(affine[0, 0]) + abs(affine[0, 1]))
+    wide = 0.5 + 0.5 * (abs(affine[1, 0]) + abs(affine[1, 1]))
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
+            row = affine[0, 0] * i + affine[0, 1] * j + affine[0, 2]
+            col = affine[1, 0] * i + affine[1, 1] * j + affine[1, 2]
+            if row < -high or col < -wide or row > rows - 1 + high or col > cols - 1 + wide:
+                continue
             for a in range(finer):
                 y = i + (a + 0.5) / finer - 0.5
                 for b in range(finer):
