@@ -13,7 +13,7 @@ from btfpipe.errors import InputError
 from btfpipe.formats import curet
 from btfpipe.formats.archive import open_archive
 from btfpipe.formats.compress_z import compress
-from btfpipe.formats.curet_geometry import outline, resample
+from btfpipe.formats.curet_geometry import find_shifts, outline, resample
 from btfpipe.formats.images import encode_picture, read_picture
 from btfpipe.sample import Sample
 from btfpipe.sample.appearance import Appearance
@@ -179,27 +179,36 @@ def test_centre_height_scale_and_shifts_are_found(whole, coated):
         assert np.quantile(scores, 0.05) > 0.95
 
 
-def test_without_registration_shifts_stay_in(whole):
-    with curet.open_measurement(whole[0], register=False, threads=2) as measurement:
-        assert measurement.facts["largest_shift_pixels"] == 0
-        assert measurement.facts["registered"] == 0
+def test_a_picture_whose_texture_is_not_recognised_is_not_shifted(rng):
+    texture = smooth(60, 60, blur=1.5)[..., 0] * 200
+    greys = [texture.astype(np.uint8) for _ in range(8)]
+    greys[3] = np.roll(greys[3], (2, -1), (0, 1))
+    greys[5] = (gaussian_filter(rng.normal(size=(60, 60)), 1.5) * 200 + 100).astype(np.uint8)
+    affines = np.tile([[1.0, 0, 6], [0, 1, 6]], (8, 1, 1))
+    frontal = np.tile([0.0, 0, 1], (8, 1))
+    shifts, registered = find_shifts(greys, affines, frontal, frontal, 48)
+    assert registered.tolist() == [True] * 5 + [False] + [True] * 2
+    want = np.zeros((8, 2))
+    want[3] = 2, -1
+    np.testing.assert_allclose(shifts, want, atol=0.05)
 
 
 def test_the_number_of_threads_changes_nothing(whole):
     with (
-        curet.open_measurement(whole[0], view_limit_deg=40, threads=1) as one,
-        curet.open_measurement(whole[0], view_limit_deg=40, threads=3) as three,
+        curet.open_measurement(whole[0], view_limit_deg=25, threads=1) as one,
+        curet.open_measurement(whole[0], view_limit_deg=25, threads=3) as three,
     ):
         assert one.facts == three.facts
         np.testing.assert_array_equal(one.read(5), three.read(5))
 
 
 def test_oblique_views_are_dropped_and_counted(whole):
-    with curet.open_measurement(whole[0], view_limit_deg=60, register=False) as measurement:
-        # 118 rows of the published table, and the one at 60 degrees to the last digit
+    with curet.open_measurement(whole[0], view_limit_deg=30, register=False) as measurement:
         used = numbers_of(measurement)
-        assert len(used) == int((PAIRS.view[:, 2] >= 0.5 - 1e-9).sum())
+        assert len(used) == int((PAIRS.view[:, 2] >= np.cos(np.radians(30)) - 1e-9).sum())
         assert len(measurement.facts["dropped"]) == 205 - len(used)
+        assert measurement.facts["largest_shift_pixels"] == 0
+        assert measurement.facts["registered"] == 0
         assert measurement.facts["missing"] == []
 
 
