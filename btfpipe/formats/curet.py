@@ -220,8 +220,10 @@ def open_measurement(
                 data = unpack_bmp(data, label)
                 name = re.sub(r"\.z$", "", name, flags=re.IGNORECASE)
             picture = decoder.decode(data, label)
-            if is_mislabelled(COPY.sub("", name), picture.suffix):
-                mislabelled.append(listing.pictures[number])
+            original = listing.pictures[number]
+            # a picture is loaded for the fit and again when read
+            if is_mislabelled(COPY.sub("", name), picture.suffix) and original not in mislabelled:
+                mislabelled.append(original)
             values = colours(picture, label)
             if values.dtype != np.uint8:
                 raise InputError(

@@ -502,6 +502,11 @@ def test_a_bmp_may_be_padded_and_carry_any_name(coated, tmp_path):
     file.write_bytes(compress(data))  # packed, though its name does not say so
     with curet.open_measurement(path, side=40) as measurement:
         assert measurement.read(0).shape == (40, 40, 3)
+        assert measurement.facts["mislabelled"] == []
+    file.write_bytes(encode_picture(read_picture(data), ".png"))
+    with curet.open_measurement(path, side=40) as measurement:
+        measurement.read(0)
+        assert measurement.facts["mislabelled"] == ["sample05/05-054.bmp"]
 
 
 def test_sets_without_usable_pictures_or_room_for_the_patch_are_refused(coated, tmp_path):
