@@ -27,7 +27,7 @@ _FILL = 0.75  # of the frame's shorter side
 def write_curet(
     path,
     appearance,
-    sample_number,
+    sample_number=1,
     *,
     suffix=".bmp.Z",
     frame=(480, 640),
@@ -41,6 +41,7 @@ def write_curet(
     height=0.0,
     numbers=None,
     threads=1,
+    on_progress=None,
 ):
     """Write the pictures that CUReT would have of an Appearance, and its ``acal.dat``.
 
@@ -76,6 +77,8 @@ def write_curet(
         Pictures to write; by default all 205.
     threads : int
         Never changes the result.
+    on_progress : callable, optional
+        Called with (pictures done, pictures in all).
 
     Returns
     -------
@@ -147,6 +150,8 @@ def write_curet(
             put(f"sample{sample_number:02d}/{sample_number:02d}-{number:03d}{suffix}", data)
             facts["pictures"] += 1
             facts["clipped_pixels"] += clipped
+            if on_progress is not None:
+                on_progress(facts["pictures"], len(wanted))
     return facts
 
 

@@ -19,6 +19,7 @@ FORMATS = {
         "btfpipe.formats.utia", "open_measurement", ("pairs", "frontal", "directions", "colour")
     ),
     "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs", "frontal")),
+    "curet": Format("btfpipe.formats.curet", "open_measurement", ("sample_number",)),
     "picture": Format("btfpipe.formats.pictures", "open_measurement", ()),
 }
 

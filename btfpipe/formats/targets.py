@@ -10,6 +10,7 @@ Writer = namedtuple("Writer", "module function options")
 WRITERS = {
     "ubo": Writer("btfpipe.formats.ubo_writing", "write_ubo", ("suffix",)),
     "utia": Writer("btfpipe.formats.utia", "write_utia", ("suffix",)),
+    "curet": Writer("btfpipe.formats.curet_writing", "write_curet", ("suffix", "sample_number")),
     "rti": Writer("btfpipe.formats.rti", "write_lp", ("suffix",)),
     "pairs": Writer("btfpipe.formats.pairs", "write_pairs", ("suffix",)),
 }

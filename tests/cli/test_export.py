@@ -1,0 +1,82 @@
+import json
+
+import numpy as np
+import pytest
+
+from btfpipe.compression.svd import compress_svd
+from btfpipe.directions import bonn81
+from btfpipe.metrics.comparison import matching_pairs
+from btfpipe.sample import Sample
+
+
+@pytest.fixture
+def small(make_sample, tmp_path):
+    """A Sample file of one view, straight down, and two more."""
+    path = tmp_path / "s.npz"
+    make_sample(12, 12, lights=bonn81()[:7], views=bonn81()[:3]).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("format_", "suffix", "taken_for", "atol"),
+    [
+        ("ubo", ".png", "ubo", 0.02),
+        ("ubo", ".exr", "ubo", 1e-3),
+        ("utia", ".exr", "utia", 3e-3),
+        ("pairs", ".exr", "pairs", 1e-3),
+        ("rti", ".png", "rti", 0.02),
+    ],
+)
+def test_what_is_exported_is_ingested_as_it_was(
+    btfpipe, small, tmp_path, format_, suffix, taken_for, atol
+):
+    target = tmp_path / "set.zip"
+    btfpipe("export", small, "--format", format_, "--suffix", suffix, "-o", target)
+    done = btfpipe("ingest", target, "-o", tmp_path / "back.npz", "--json")
+    facts = json.loads(done.stdout)
+    assert facts["taken_for"] == taken_for
+    sample, back = Sample.open(small), Sample.open(tmp_path / "back.npz")
+    found = matching_pairs(sample, back)
+    assert len(back.light_directions) == 7
+    assert back.n_pairs == (7 if format_ == "rti" else 21)
+    ours = sample.pictures(found)
+    theirs = back.pictures(slice(None))
+    scale = 1.0 if back.absolute or suffix == ".exr" else (ours * theirs).sum() / (theirs**2).sum()
+    np.testing.assert_allclose(theirs * scale, ours, atol=atol)
+
+
+def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
+    model = compress_svd(make_sample(12, 12), 6)
+    model.save(tmp_path / "m.npz")
+    btfpipe("export", tmp_path / "m.npz", "--suffix", ".exr", "-o", tmp_path / "folder")
+    btfpipe("ingest", tmp_path / "folder", "-o", tmp_path / "back.npz")
+    back = Sample.open(tmp_path / "back.npz")
+    np.testing.assert_allclose(
+        back.pictures(slice(None)),
+        model.pictures(matching_pairs(model, back)),
+        rtol=1e-3,
+        atol=1e-3,
+    )
+
+
+def test_an_option_of_another_format_is_refused(btfpipe, small, tmp_path):
+    done = btfpipe(
+        "export", small, "--format", "pairs", "--sample-number", 3, "-o", tmp_path / "x.zip", code=2
+    )
+    assert "--sample-number is not for pairs" in done.stderr
+    assert not list(tmp_path.glob("x.zip*"))
+
+
+def test_every_format_of_the_tables_is_offered():
+    import importlib
+
+    compress, export, ingest = (
+        importlib.import_module(f"btfpipe.cli.{n}") for n in ("compress", "export", "ingest")
+    )
+    from btfpipe.compression import METHODS
+    from btfpipe.formats.sources import FORMATS
+    from btfpipe.formats.targets import WRITERS
+
+    assert set(ingest._FORMATS) == set(FORMATS)
+    assert set(export._FORMATS) == set(WRITERS)
+    assert set(compress._METHODS) == {name for name, m in METHODS.items() if m.function}
