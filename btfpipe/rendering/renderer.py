@@ -92,10 +92,24 @@ class Renderer:
         kernels.resolve(
             hits, film.samples, radiance, depth, points.normal, points.texels(), picture
         )
+        self._add_environments(directions, found["primID"] < 0, picture)
         if self.scene.background is not None:
             picture[:, :3] += (1 - picture[:, 3:4]) * self.scene.background
             picture[:, 3] = 1
         return picture.reshape(height, width, -1).astype(np.float32)
+
+    def _add_environments(self, directions, missed, picture):
+        """Show the visible environments where rays have hit nothing."""
+        shown = [e for e in self.scene.environments if e.visible]
+        if not shown:
+            return
+        missed = np.flatnonzero(missed)
+        seen = sum(e.radiance(directions[missed]) for e in shown)
+        pixel = missed // self.scene.film.samples
+        for c in range(3):
+            total = np.bincount(pixel, seen[:, c], len(picture))
+            picture[:, c] += total / self.scene.film.samples
+        picture[:, 3] = 1
 
     def _add_light(self, light, points, radiance):
         """Add one light's share to the radiance of all points."""
