@@ -115,21 +115,19 @@ class Renderer:
         """Add one light's share to the radiance of all points."""
         n = len(points.hits)
         w_i, irradiance = np.empty((n, 3)), np.empty((n, 3))
-        far, lit = np.empty(n), np.empty(n, np.int64)
+        lit, far = np.empty(n, np.int64), np.empty(n, np.float32)
+        origin, toward = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         count = kernels.light_rays(
             light.directional, light.place, light.power, points.start, points.point,
-            points.normal, w_i, irradiance, far, lit,
+            points.normal, w_i, irradiance, lit, origin, toward, far,
         )  # fmt: skip
-        lit = lit[:count]
         blocked = self.tree.run(
-            points.start[lit].astype(np.float32),
-            w_i[lit].astype(np.float32),
-            dists=far[lit].astype(np.float32),
-            query="OCCLUDED",
+            origin[:count], toward[:count], dists=far[:count], query="OCCLUDED"
         )
-        lit = lit[blocked < 0]
+        lit = lit[:count][blocked < 0]
+        owner = points.thing[lit]
         for number, thing in enumerate(self.scene.objects):
-            mine = lit[points.thing[lit] == number]
+            mine = lit[owner == number]
             if thing.dressing is None:
                 kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
             elif len(mine):
