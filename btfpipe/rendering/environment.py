@@ -229,7 +229,11 @@ def _latlong_pixels(rows, cols):
     solid_angle = np.repeat((edge[:-1] - edge[1:])[:, None] * 2 * np.pi / cols, cols, axis=1)
     polar = np.pi * (np.arange(rows) + 0.5)[:, None] / rows
     azimuth = 2 * np.pi * ((np.arange(cols) + 0.5) / cols - 0.5)  # from -z towards +x
-    own = [np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, -np.sin(polar) * np.cos(azimuth)]
+    own = [
+        np.sin(polar) * np.sin(azimuth),
+        np.cos(polar) + 0 * azimuth,
+        -np.sin(polar) * np.cos(azimuth),
+    ]
     return np.stack(own, axis=-1), solid_angle
 
 

@@ -121,9 +121,7 @@ class Renderer:
             light.directional, light.place, light.power, points.start, points.point,
             points.normal, w_i, irradiance, lit, origin, toward, far,
         )  # fmt: skip
-        blocked = self.tree.run(
-            origin[:count], toward[:count], dists=far[:count], query="OCCLUDED"
-        )
+        blocked = self.tree.run(origin[:count], toward[:count], dists=far[:count], query="OCCLUDED")
         lit = lit[:count][blocked < 0]
         owner = points.thing[lit]
         for number, thing in enumerate(self.scene.objects):
