@@ -76,7 +76,9 @@ class Environment:
         self.turn = np.eye(3) if turn is None else np.asarray(turn, float)
         self._used = self._grid()[1] > 0
         _require_radiance(values, self._used, name)
-        self.values = values.astype(np.float32) * np.float32(intensity)
+        with np.errstate(over="ignore"):
+            self.values = values.astype(np.float32) * np.float32(intensity)
+        _require_radiance(self.values, self._used, f"{name} times intensity {intensity:g}")
         if projection == "probe":
             _fill_outside(self.values)
 
@@ -97,7 +99,11 @@ class Environment:
         """
         own, solid_angles = self._grid()
         used = self._used
-        return own[used] @ self.turn.T, solid_angles[used], self.values[used].astype(np.float64)
+        return (
+            _turned(own[used], self.turn),
+            solid_angles[used],
+            self.values[used].astype(np.float64),
+        )
 
     @property
     def power(self):
@@ -107,7 +113,7 @@ class Environment:
 
     def radiance(self, directions):
         """Radiance (..., 3) float64 from unit vectors (..., 3) of the scene, bilinear between the pixels."""
-        own = np.asarray(directions, float) @ self.turn
+        own = _turned(np.asarray(directions, float), self.turn.T)
         rows, cols = self.values.shape[:2]
         x, y, z = own[..., 0], own[..., 1], np.clip(own[..., 2], -1, 1)
         if self.projection == "latlong":
@@ -157,10 +163,10 @@ class Environment:
         count : int
             Most lights; 12 at least for ``q2tree``.
         method : str
-            ``q2tree``: a quadtree over the sphere, after Wan, Wong and Leung 2005. Its roots are the twelve curvilinear
-            quadrilaterals of HEALPix (Gorski et al. 2005), which halve along both of their sides into four of equal area; the region
-            of the largest importance, luminous power times solid angle to 1/4 (Agarwal et al. 2003), is split as long as `count`
-            allows. Deterministic.
+            ``q2tree``: a quadtree over the sphere, after Wan, Wong and Leung 2005; roots and importance are chosen here. Its roots
+            are the twelve curvilinear quadrilaterals of HEALPix (Górski et al. 2005), which halve along both of their sides into
+            four of equal area; the region of the largest importance, luminous power times solid angle to 1/4 (Agarwal et al. 2003),
+            is split as long as `count` allows. Deterministic.
             ``median-cut``: Debevec 2005, regions of equal luminous power by repeated cuts across the longer side. Deterministic. For
             counts that are not powers of two, power is cut in proportion to the lights on each side.
             ``alias``: random pixels by luminous power (Walker's alias table as Vose 1991 builds it), weighted so that the
@@ -187,7 +193,7 @@ class Environment:
             raise InputError(f"lights: {count}; {method} needs at least {least}.")
         directions, solid_angles, radiances = self.pixels()
         power = solid_angles[:, None] * radiances
-        luminous = power @ _LUMINANCE
+        luminous = (power * _LUMINANCE).sum(axis=1)
         if not luminous.any():
             return np.empty((0, 3)), np.empty((0, 3))
         if method == "alias":
@@ -205,6 +211,11 @@ class Environment:
         irradiance = np.add.reduceat(power, first)
         lit = irradiance.any(axis=1)
         return mean[lit], irradiance[lit]
+
+
+def _turned(directions, turn):
+    """Directions (..., 3) by a rotation; without BLAS, whose rounding may change with its threads."""
+    return np.einsum("...j,kj->...k", directions, turn)
 
 
 def _require_radiance(values, used, name):
