@@ -51,7 +51,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     """
     import time
 
-    from btfpipe.formats.images import write_picture
+    from btfpipe.formats.images import colours, open_picture, write_picture
     from btfpipe.formats.meshes import read_mesh
     from btfpipe.rendering.renderer import LAYERS
     from btfpipe.rendering.renderer import render as render_scene
@@ -62,7 +62,14 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     film = {"width": width, "height": height, "samples": samples}
     start = time.perf_counter()
     loaded = load_scene(
-        scene, bindings, film=film, read_mesh=read_mesh, memory=memory, threads=threads
+        scene,
+        bindings,
+        film=film,
+        read_mesh=read_mesh,
+        read_picture=lambda path: colours(open_picture(path), path),
+        memory=memory,
+        threads=threads,
+        seed=seed,
     )
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()

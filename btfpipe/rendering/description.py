@@ -43,11 +43,12 @@ def read_description(path, bindings=None):
     if not scene["lights"]:
         raise InputError(f"{path}: lights is empty; a scene needs at least one light.")
     unused = set(bindings or {})
-    for number, thing in enumerate(scene["objects"]):
-        for key in ("surface", "map", "model", "mesh"):
-            if key in thing:
-                unused.discard(thing[key].removeprefix("$"))
-                thing[key] = _file(path, f"objects[{number}].{key}", thing[key], bindings or {})
+    for part in ("lights", "objects"):
+        for number, thing in enumerate(scene[part]):
+            for key in ("surface", "map", "model", "mesh"):
+                if key in thing:
+                    unused.discard(thing[key].removeprefix("$"))
+                    thing[key] = _file(path, f"{part}[{number}].{key}", thing[key], bindings or {})
     if unused:
         raise InputError(f"{path}: no file is named ${sorted(unused)[0]}, which --bind gives.")
     return scene

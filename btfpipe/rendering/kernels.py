@@ -162,24 +162,27 @@ def surface_points(
 
 
 @njit(cache=True, nogil=True)
-def light_rays(directional, place, power, start, point, normal, w_i, irradiance, far, lit):
-    """Direction to the light (n, 3), irradiance across it (n, 3) and distance (n,) at each point, float64.
+def light_rays(
+    directional, place, power, start, point, normal, w_i, irradiance, lit, origin, toward, far
+):
+    """Direction to the light (n, 3) and irradiance across it (n, 3) at each point, float64.
 
-    Returns the number of points whose shading normal faces the light; `lit` (n,) int64 lists them.
+    Returns the number of points whose shading normal faces the light; `lit` (n,) int64 lists them, and origin (n, 3), direction
+    `toward` (n, 3) and length `far` (n,) float32 of their shadow rays are filled in the same order.
     """
     count = 0
     for h in range(len(point)):
         x, y, z = place[0], place[1], place[2]
         falloff = 1.0
         length = 1.0
-        far[h] = 1e30
+        away = 1e30
         if not directional:
             x -= point[h, 0]
             y -= point[h, 1]
             z -= point[h, 2]
             falloff = max(x * x + y * y + z * z, 1e-30)
             length = np.sqrt(falloff)
-            far[h] = np.sqrt(
+            away = np.sqrt(
                 (place[0] - start[h, 0]) ** 2
                 + (place[1] - start[h, 1]) ** 2
                 + (place[2] - start[h, 2]) ** 2
@@ -191,6 +194,10 @@ def light_rays(directional, place, power, start, point, normal, w_i, irradiance,
             irradiance[h, c] = power[c] / falloff
         if w_i[h, 0] * normal[h, 0] + w_i[h, 1] * normal[h, 1] + w_i[h, 2] * normal[h, 2] > 0.0:
             lit[count] = h
+            for c in range(3):
+                origin[count, c] = start[h, c]
+                toward[count, c] = w_i[h, c]
+            far[count] = away
             count += 1
     return count
 

@@ -263,20 +263,25 @@ def transformed(thing, transform):
     """The same Thing scaled, turned and shifted; changes `thing` and returns it."""
     if not transform:
         return thing
-    axis = np.array(transform.get("axis", [0, 1, 0]), float)
-    if np.linalg.norm(axis) < 1e-12:
-        raise InputError("transform: axis is zero; give the direction to turn about.")
-    axis = axis / np.linalg.norm(axis)
-    angle = np.radians(transform.get("rotate_deg", 0))
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    turn = rotation(transform, "transform: ")
     thing.vertices = thing.vertices * transform.get("scale", 1) @ turn.T
     thing.vertices += np.array(transform.get("translate", [0, 0, 0]), float)
     thing.normals = np.ascontiguousarray(thing.normals @ turn.T, np.float32)
     if thing.dressing is not None:
         thing.dressing.axis = np.ascontiguousarray(thing.dressing.axis @ turn.T, np.float32)
     return thing
+
+
+def rotation(settings, where=""):
+    """Matrix (3, 3) that turns column vectors as ``rotate_deg`` about ``axis`` says; `where` starts its message."""
+    axis = np.array(settings.get("axis", [0, 1, 0]), float)
+    if np.linalg.norm(axis) < 1e-12:
+        raise InputError(f"{where}axis is zero; give the direction to turn about.")
+    axis = axis / np.linalg.norm(axis)
+    angle = np.radians(settings.get("rotate_deg", 0))
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 @njit(cache=True, nogil=True)

@@ -92,30 +92,40 @@ class Renderer:
         kernels.resolve(
             hits, film.samples, radiance, depth, points.normal, points.texels(), picture
         )
+        self._add_environments(directions, found["primID"] < 0, picture)
         if self.scene.background is not None:
             picture[:, :3] += (1 - picture[:, 3:4]) * self.scene.background
             picture[:, 3] = 1
         return picture.reshape(height, width, -1).astype(np.float32)
 
+    def _add_environments(self, directions, missed, picture):
+        """Show the visible environments where rays have hit nothing."""
+        shown = [e for e in self.scene.environments if e.visible]
+        if not shown:
+            return
+        missed = np.flatnonzero(missed)
+        seen = sum(e.radiance(directions[missed]) for e in shown)
+        pixel = missed // self.scene.film.samples
+        for c in range(3):
+            total = np.bincount(pixel, seen[:, c], len(picture))
+            picture[:, c] += total / self.scene.film.samples
+        picture[:, 3] = 1
+
     def _add_light(self, light, points, radiance):
         """Add one light's share to the radiance of all points."""
         n = len(points.hits)
         w_i, irradiance = np.empty((n, 3)), np.empty((n, 3))
-        far, lit = np.empty(n), np.empty(n, np.int64)
+        lit, far = np.empty(n, np.int64), np.empty(n, np.float32)
+        origin, toward = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         count = kernels.light_rays(
             light.directional, light.place, light.power, points.start, points.point,
-            points.normal, w_i, irradiance, far, lit,
+            points.normal, w_i, irradiance, lit, origin, toward, far,
         )  # fmt: skip
-        lit = lit[:count]
-        blocked = self.tree.run(
-            points.start[lit].astype(np.float32),
-            w_i[lit].astype(np.float32),
-            dists=far[lit].astype(np.float32),
-            query="OCCLUDED",
-        )
-        lit = lit[blocked < 0]
+        blocked = self.tree.run(origin[:count], toward[:count], dists=far[:count], query="OCCLUDED")
+        lit = lit[:count][blocked < 0]
+        owner = points.thing[lit]
         for number, thing in enumerate(self.scene.objects):
-            mine = lit[points.thing[lit] == number]
+            mine = lit[owner == number]
             if thing.dressing is None:
                 kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
             elif len(mine):

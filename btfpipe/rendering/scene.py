@@ -1,7 +1,7 @@
 """The Scene: camera, film, lights and objects, loaded and checked against each other."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from btfpipe.errors import InputError
 from btfpipe.rendering import objects
 from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
 from btfpipe.rendering.description import read_description
+from btfpipe.rendering.environment import Environment
 from btfpipe.rendering.renderer import tile_bytes
 from btfpipe.sample import Sample
 
@@ -47,11 +48,14 @@ class Scene:
     camera : Camera
     film : Film
     lights : list of Light
+        Those that stand for environment maps among them.
     objects : list of Thing
     background : (3,) float64 or None
         Radiance where nothing is hit; None is transparent black.
     files : list of Path
         What the scene was loaded from, without the description itself.
+    environments : list of Environment
+        Those that are visible are seen where nothing is hit.
     """
 
     camera: Camera
@@ -60,9 +64,20 @@ class Scene:
     objects: list
     background: np.ndarray | None = None
     files: list | None = None
+    environments: list = field(default_factory=list)
 
 
-def load_scene(path, bindings=None, *, film=None, read_mesh=None, memory=None, threads=1):
+def load_scene(
+    path,
+    bindings=None,
+    *,
+    film=None,
+    read_mesh=None,
+    read_picture=None,
+    memory=None,
+    threads=1,
+    seed=0,
+):
     """Load a scene's description and all files that it names.
 
     Parameters
@@ -75,10 +90,14 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None, memory=None, t
         Replaces entries of its film.
     read_mesh : callable, optional
         Path to (vertices, faces) of a foreign mesh file.
+    read_picture : callable, optional
+        Path to (rows, cols, 3) colours of a picture file, for environment maps.
     memory : int, optional
         Bytes that the copies of Samples to shade from, and the tiles in work, may take.
     threads : int
         That will render; each works on a tile.
+    seed : int
+        Of environment maps sampled at random.
 
     Returns
     -------
@@ -96,8 +115,23 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None, memory=None, t
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
     try:
-        lights = [_light(i, light) for i, light in enumerate(description["lights"])]
-        opened, things, grounds, files = {}, [], [], []
+        lights, environments, opened, things, grounds, files = [], [], {}, [], [], []
+        for number, light in enumerate(description["lights"]):
+            if light["type"] == "environment":
+                files.append(light["map"])
+                try:
+                    environment = _environment(light, read_picture)
+                    lights += _stand_for(environment, light, seed)
+                except InputError as error:
+                    raise InputError(f"lights[{number}]: {error}") from error
+                environments.append(environment)
+                if environment.visible and "background" in description:
+                    raise InputError(
+                        f"background: lights[{number}] shows its map there; leave out background, or give"
+                        " visible: false with the light."
+                    )
+            else:
+                lights.append(_light(number, light))
         room = None if memory is None else (memory, threads * tile_bytes(film.samples))
         for number, entry in enumerate(description["objects"]):
             files += [entry[key] for key in ("surface", "map", "model", "mesh") if key in entry]
@@ -128,7 +162,7 @@ def load_scene(path, bindings=None, *, film=None, read_mesh=None, memory=None, t
     return Scene(
         camera, film, lights, things,
         None if background is None else np.array(background, float),
-        list(dict.fromkeys(files)),
+        list(dict.fromkeys(files)), environments,
     )  # fmt: skip
 
 
@@ -140,6 +174,27 @@ def _light(number, light):
     if length < 1e-12:
         raise InputError(f"lights[{number}]: direction is zero; it points towards the light.")
     return Light(True, direction / length, np.array(light["irradiance"], float))
+
+
+def _environment(light, read_picture):
+    if read_picture is None:
+        raise InputError(f"{light['map']}: no reader of pictures at hand; pass load_scene one.")
+    return Environment(
+        read_picture(light["map"]),
+        light.get("projection"),
+        intensity=light.get("intensity", 1.0),
+        turn=objects.rotation(light),
+        visible=light.get("visible", True),
+        name=light["map"],
+    )
+
+
+def _stand_for(environment, light, seed):
+    """The directional lights of an environment."""
+    directions, irradiances = environment.lights(
+        light.get("lights", 64), light.get("method", "q2tree"), seed
+    )
+    return [Light(True, *both) for both in zip(directions, irradiances, strict=True)]
 
 
 def _require_room(path, opened, room):
