@@ -27,6 +27,7 @@ include: "workflow/rules/surface.smk"
 include: "workflow/rules/synthesize.smk"
 include: "workflow/rules/render.smk"
 include: "workflow/rules/compare.smk"
+include: "workflow/rules/formats.smk"
 
 
 rule all:
@@ -34,3 +35,4 @@ rule all:
     input:
         all_pictures(),
         all_fidelity(),
+        all_exports(),

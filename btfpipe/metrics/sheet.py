@@ -61,10 +61,10 @@ def error_sheet(sample, comparisons, pictures_of):
         drawn = drawn.repeat(zoom, 0).repeat(zoom, 1)
         overall = comparison.overall()["display"]
         title = f"{name}: display RMSE {overall['rmse']:.4f}"
-        maps.append(_titled(drawn, title))
+        maps.append(titled(drawn, title))
     bar = ramp(np.linspace(1, 0, maps[0].shape[0] - _TEXT - _GAP)[:, None].repeat(16, 1))
-    bar = _titled(bar, f"{worst:.3f}", _label("0", 60))
-    blocks = [_titled(_beside([*maps, bar]), f"display RMSE of each pair ({what})")]
+    bar = titled(bar, f"{worst:.3f}", _label("0", 60))
+    blocks = [titled(beside([*maps, bar]), f"display RMSE of each pair ({what})")]
 
     comparison = next(iter(comparisons.values()))
     order = comparison.order()
@@ -84,7 +84,7 @@ def error_sheet(sample, comparisons, pictures_of):
         factor = min(2.0 ** np.floor(np.log2(0.9 / largest)), 1024.0) if largest > 0 else 1.0
         zoom = max(1, 192 // max(sample.shape))
         row = [
-            _titled(_to_bytes(p).repeat(zoom, 0).repeat(zoom, 1), title)
+            titled(to_bytes(p).repeat(zoom, 0).repeat(zoom, 1), title)
             for p, title in (
                 (reference, "sample"),
                 (model, "model"),
@@ -102,8 +102,8 @@ def error_sheet(sample, comparisons, pictures_of):
             f"{word}: pair {pair}, light {light}, view {view}, display RMSE"
             f" {comparison.display_rmse[pair]:.4f}"
         )
-        blocks.append(_titled(_beside(row), title))
-    return _below(blocks)
+        blocks.append(titled(beside(row), title))
+    return below(blocks)
 
 
 def _angles(direction):
@@ -113,7 +113,8 @@ def _angles(direction):
     return f"({theta:.0f}, {phi % 360:.0f}) deg"
 
 
-def _to_bytes(picture):
+def to_bytes(picture):
+    """8-bit codes of display values."""
     return np.round(picture * 255).astype(np.uint8)
 
 
@@ -130,11 +131,13 @@ def _label(text, width):
     return line[:, : max(width, int(used[-1]) + 4 if len(used) else 1)]
 
 
-def _titled(picture, title, *below):
-    return _below([_label(title, picture.shape[1]), picture, *below], gap=0)
+def titled(picture, title, *lines):
+    """A picture with a line of text above, and more pictures under it."""
+    return below([_label(title, picture.shape[1]), picture, *lines], gap=0)
 
 
-def _beside(pictures):
+def beside(pictures):
+    """Pictures in a row, on white."""
     height = max(p.shape[0] for p in pictures)
     padded = [
         np.pad(p, ((0, height - p.shape[0]), (0, _GAP), (0, 0)), constant_values=255)
@@ -143,7 +146,8 @@ def _beside(pictures):
     return np.concatenate(padded, axis=1)
 
 
-def _below(pictures, gap=_GAP):
+def below(pictures, gap=_GAP):
+    """Pictures in a column, on white."""
     width = max(p.shape[1] for p in pictures)
     padded = [
         np.pad(p, ((0, gap), (0, width - p.shape[1]), (0, 0)), constant_values=255)

@@ -209,24 +209,35 @@ def sample_sheet(appearance, lights=6, views=6):
     """
     from btfpipe.directions import to_angles
 
-    w_i, w_o = (np.asarray(a) for a in (appearance.light_directions, appearance.view_directions))
-    of_light, of_view = np.asarray(appearance.light_index), np.asarray(appearance.view_index)
-    if appearance.is_product:
-        light, view = _spread(w_i, w_i[:, 2], lights), _spread(w_o, w_o[:, 2], views)
-        pairs = [v * len(w_i) + i for v in view for i in light]
-        columns = len(light)
-    else:
-        points = np.concatenate([w_i[of_light], w_o[of_view]], axis=1)
-        pairs = _spread(points, points[:, 2] + points[:, 5], lights * views)
-        columns = min(lights, len(pairs))
+    pairs, columns = sample_sheet_pairs(appearance, lights, views)
+    w_i, w_o = (
+        np.asarray(table)[np.asarray(index)]
+        for table, index in (
+            (appearance.light_directions, appearance.light_index),
+            (appearance.view_directions, appearance.view_index),
+        )
+    )
     pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
     labels = [
         "light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(
-            *np.degrees(to_angles(w_i[of_light[pair]])), *np.degrees(to_angles(w_o[of_view[pair]]))
+            *np.degrees(to_angles(w_i[pair])), *np.degrees(to_angles(w_o[pair]))
         )
         for pair in pairs
     ]
     return pictures, labels, columns
+
+
+def sample_sheet_pairs(appearance, lights, views):
+    """The pairs that `sample_sheet` shows, and how many stand in a row."""
+    w_i, w_o = (np.asarray(a) for a in (appearance.light_directions, appearance.view_directions))
+    if appearance.is_product:
+        light, view = _spread(w_i, w_i[:, 2], lights), _spread(w_o, w_o[:, 2], views)
+        return [v * len(w_i) + i for v in view for i in light], len(light)
+    points = np.concatenate(
+        [w_i[np.asarray(appearance.light_index)], w_o[np.asarray(appearance.view_index)]], axis=1
+    )
+    pairs = _spread(points, points[:, 2] + points[:, 5], lights * views)
+    return pairs, min(lights, len(pairs))
 
 
 def _spread(points, frontal, count):

@@ -11,6 +11,7 @@ validate(config, "../schemas/config.schema.yaml")
 
 RESULTS = Path(config["results"]).as_posix().rstrip("/")
 LOOKS = config["looks"]
+EXPORTS = config["exports"]
 PLAIN_LOOKS = [name for name, look in LOOKS.items() if look.get("plain")]
 TRUE_SAMPLES = [name for name, sample in config["samples"].items() if "truth" in sample]
 
@@ -26,14 +27,27 @@ def check_names():
                 )
 
 
+    for name in EXPORTS:
+        if name not in config["samples"]:
+            raise WorkflowError(
+                f"exports.{name} is no sample; expected one of {', '.join(config['samples'])}."
+            )
+
+
+def one_of(names):
+    """A pattern of any of some names, of nothing if there are none."""
+    return "|".join(map(re.escape, names)) or "(?!)"
+
+
 check_names()
 
 
 wildcard_constraints:
-    sample="|".join(map(re.escape, config["samples"])),
-    surface="|".join(map(re.escape, config["surfaces"])),
-    look="|".join(map(re.escape, LOOKS)),
-    scene="|".join(map(re.escape, config["scenes"])),
+    sample=one_of(config["samples"]),
+    surface=one_of(config["surfaces"]),
+    look=one_of(LOOKS),
+    scene=one_of(config["scenes"]),
+    format="ubo|utia|curet|rti|pairs|btf",
 
 
 def code(*parts):
@@ -100,3 +114,14 @@ def all_fidelity():
     return [at("fidelity.md")] + expand(
         at("fidelity/{sample}.model.png"), sample=config["samples"]
     )
+
+
+def exported(wildcards):
+    """The file that a sample is written to in a format."""
+    ending = "btf" if wildcards.format == "btf" else "zip"
+    return at(f"exports/{wildcards.sample}.{wildcards.format}.{ending}")
+
+
+def all_exports():
+    """The sheets of what was written in every format and read back."""
+    return expand(at("formats/{sample}.png"), sample=EXPORTS)

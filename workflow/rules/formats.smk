@@ -1,0 +1,76 @@
+rule export:
+    input:
+        sample=at("samples/{sample}.sample.npz"),
+    output:
+        file=at("exports/{sample}.{format}.{ending}"),
+        summary=at("summaries/export/{sample}.{format}.{ending}.json"),
+    log:
+        at("logs/export/{sample}.{format}.{ending}.log"),
+    benchmark:
+        at("benchmarks/export/{sample}.{format}.{ending}.jsonl")
+    wildcard_constraints:
+        ending="zip|btf",
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=2000,
+    params:
+        code=code("compression", "cli/export.py"),
+    message:
+        "writing {wildcards.sample} as {wildcards.format}"
+    shell:
+        "btfpipe export {input.sample:q} --format {wildcards.format}"
+        " --threads {threads} --out {output.file:q} --json > {output.summary:q} 2> {log:q}"
+
+
+rule ingest_export:
+    input:
+        file=exported,
+    output:
+        appearance=at("formats/{sample}.{format}.npz"),
+        summary=at("summaries/ingest_export/{sample}.{format}.json"),
+    log:
+        at("logs/ingest_export/{sample}.{format}.log"),
+    benchmark:
+        at("benchmarks/ingest_export/{sample}.{format}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    threads: 2
+    resources:
+        mem_mb=2000,
+    params:
+        code=code("cli/ingest.py"),
+    message:
+        "reading {wildcards.sample} back from {wildcards.format}"
+    shell:
+        "btfpipe ingest {input.file:q}"
+        " --threads {threads} --out {output.appearance:q} --json > {output.summary:q} 2> {log:q}"
+
+
+rule formats_sheet:
+    input:
+        sample=at("samples/{sample}.sample.npz"),
+        appearances=lambda wildcards: [
+            at(f"formats/{wildcards.sample}.{name}.npz") for name in EXPORTS[wildcards.sample]
+        ],
+    output:
+        sheet=report(
+            at("formats/{sample}.png"),
+            caption="../report/formats.rst",
+            category="Formats",
+            labels={"sample": "{sample}", "what": "written and read back"},
+        ),
+        table=at("formats/{sample}.md"),
+    log:
+        at("logs/formats_sheet/{sample}.log"),
+    benchmark:
+        at("benchmarks/formats_sheet/{sample}.jsonl")
+    conda:
+        "../envs/btfpipe.yaml"
+    params:
+        code=code("metrics", "compression"),
+    message:
+        "laying out {wildcards.sample} as every format gives it back"
+    script:
+        "../scripts/formats_sheet.py"
