@@ -41,21 +41,23 @@ class HarmonicsShader:
 
 
 @leaf(fastmath=FAST)
-def weigh(view, light, minimum, step, weights, base):
-    """Fill the weight (3, view terms * light terms) of each code in a value, and what all codes at 0 give (3,).
+def multiply(view, light, products):
+    """Fill ``products`` (view terms * light terms,) of the harmonics of a view and those of a light."""
+    lights = len(light)
+    for i in range(len(view)):
+        at = i * lights
+        for j in range(lights):
+            products[at + j] = view[i] * light[j]
 
-    ``light`` (3, light terms) may differ between channels, as the harmonics of a coloured environment do.
-    """
-    lights = light.shape[1]
-    for c in range(3):
-        total = np.float32(0)
-        for i in range(len(view)):
-            at = i * lights
-            for j in range(lights):
-                weight = view[i] * light[c, j]
-                weights[c, at + j] = weight * step[c, at + j]
-                total += weight * minimum[c, at + j]
-        base[c] = total
+
+@leaf(fastmath=FAST)
+def weigh(products, minimum, step, c, weights, base):
+    """Fill the weight of each code in the value of channel `c`, and what all codes at 0 give."""
+    total = np.float32(0)
+    for n in range(len(products)):
+        weights[c, n] = products[n] * step[c, n]
+        total += products[n] * minimum[c, n]
+    base[c] = total
 
 
 @leaf(fastmath=FAST)
@@ -79,7 +81,8 @@ def _shade(
     codes, minimum, step, view_table, light_table, rows, cols, toroidal, row, col, w_i, w_o, out
 ):
     view = np.empty(view_table.shape[0] ** 2, np.float32)
-    light = np.empty((3, light_table.shape[0] ** 2), np.float32)
+    light = np.empty(light_table.shape[0] ** 2, np.float32)
+    products = np.empty(minimum.shape[1], np.float32)
     weights = np.empty(minimum.shape, np.float32)
     base = np.empty(3, np.float32)
     texel = np.zeros(4, np.int64)
@@ -90,8 +93,8 @@ def _shade(
             continue
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
         fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
-        fill_harmonics(float(w_i[q, 0]), float(w_i[q, 1]), float(w_i[q, 2]), light_table, light[0])
-        light[1] = light[0]
-        light[2] = light[0]
-        weigh(view, light, minimum, step, weights, base)
+        fill_harmonics(float(w_i[q, 0]), float(w_i[q, 1]), float(w_i[q, 2]), light_table, light)
+        multiply(view, light, products)
+        for c in range(3):
+            weigh(products, minimum, step, c, weights, base)
         contract(codes, texel, share, weights, base, q, out)
