@@ -4,6 +4,9 @@ The light coefficients c of a `HarmonicsModel` at a texel and view hold only ove
 products of two harmonics over it, takes the environment's coefficients e there, once R has turned them into the
 local frame. The hemisphere couples degrees, so that e may have more terms than c: with as many (the paper's form) what a
 sharper light adds is lost. There is no shadow but the one given.
+
+R is three turns, about n, t and n. A turn about n mixes two coefficients at a time; one about t is one about n between
+two quarter turns, whose fixed, sparse matrices are made once by the recursion. Points go through this in groups, side by side.
 """
 
 import functools
@@ -23,6 +26,7 @@ from btfpipe.directions.spherical_harmonics import (
 from btfpipe.errors import InputError
 from btfpipe.sample.shading import corners
 
+_GROUP = 16  # points worked on side by side: a register's width
 # turns n into t, so that a turn about t is one about n between two turns by this
 _ASIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -61,9 +65,9 @@ class HarmonicEnvironment:
                 f"{terms} terms of an environment asked for; it has {len(coefficients)}. Project it to more."
             )
         self.shader = HarmonicsShader(model)
-        self.light = np.ascontiguousarray(coefficients[:terms].T, np.float32)
-        self.products = _coupling(model.light_terms, terms)
-        self.aside = _aside(terms)
+        self.environment = np.ascontiguousarray(coefficients[:terms], np.float32)
+        self.coupling = _coupling(model.light_terms, terms)
+        self.quarters = (*_quarter(terms, False), *_quarter(terms, True))
 
     def shade(self, row, col, frames, w_o, out, visibility=None):
         """Radiance towards the eye.
@@ -85,8 +89,8 @@ class HarmonicEnvironment:
         if visibility is None:
             visibility = np.ones(len(row), np.float32)
         _shade(
-            shader.codes, shader.minimum, shader.step, shader.view_table, self.light, self.aside, self.products,
-            shader.rows, shader.cols, shader.toroidal, row, col, frames, w_o, visibility, out,
+            shader.codes, shader.minimum, shader.step, shader.view_table,
+            self.environment, self.quarters, self.coupling, shader.rows, shader.cols, shader.toroidal, row, col, frames, w_o, visibility, out,
         )  # fmt: skip
 
 
@@ -103,123 +107,141 @@ def _coupling(light_terms, terms):
 
 
 @functools.lru_cache(maxsize=8)
-def _aside(terms):
-    """Blocks of `_ASIDE` and of its inverse (2, elements), one after the other, float32."""
-    return np.stack(
-        [
-            np.concatenate([block.ravel() for block in rotation_blocks(rotation, terms)])
-            for rotation in (_ASIDE, _ASIDE.T)
-        ]
-    ).astype(np.float32)
+def _quarter(terms, back):
+    """The matrix (terms, terms) of `_ASIDE`, or of its inverse: starts of rows, columns, elements other than 0."""
+    first, columns, elements = [0], [], []
+    for n, block in enumerate(rotation_blocks(_ASIDE.T if back else _ASIDE, terms)):
+        for row in block:
+            kept = np.flatnonzero(np.abs(row) > 1e-9)
+            columns.append(n * n + kept)
+            elements.append(row[kept])
+            first.append(first[-1] + len(kept))
+    return (
+        np.array(first, np.int32),
+        np.concatenate(columns).astype(np.int32),
+        np.concatenate(elements).astype(np.float32),
+    )
 
 
 @leaf
-def _angles(frames, q, turns):
-    """Fill cosines and sines (3, 2) of the turns about n, t, n that make up the rotation from world into frame."""
+def _angles(frames, q, p, turns):
+    """Fill cosines and sines ``turns[:, :, p]`` of the turns about n, t, n that make up the rotation into a frame."""
     sine = math.sqrt(frames[q, 2, 0] ** 2 + frames[q, 2, 1] ** 2)
-    turns[2, 0] = 1.0
-    turns[2, 1] = 0.0
-    if sine > 0.0:
-        turns[2, 0] = -frames[q, 2, 0] / sine
-        turns[2, 1] = frames[q, 2, 1] / sine
-    turns[1, 0] = frames[q, 2, 2]
-    turns[1, 1] = sine
-    # from the two others, so that a frame hardly tilted keeps the sum of both turns about n
-    turns[0, 0] = frames[q, 1, 0] * turns[2, 1] + frames[q, 1, 1] * turns[2, 0]
-    turns[0, 1] = -frames[q, 0, 0] * turns[2, 1] - frames[q, 0, 1] * turns[2, 0]
-
-
-@leaf
-def _turn(cosine, sine, coefficients, most):
-    """Turn coefficients (3, terms) about n in place; orders above `most` are left."""
-    degrees = int(math.sqrt(coefficients.shape[1]) + 0.5)
     a = 1.0
     b = 0.0
+    if sine > 0.0:
+        a = -frames[q, 2, 0] / sine
+        b = frames[q, 2, 1] / sine
+    turns[2, 0, p] = a
+    turns[2, 1, p] = b
+    turns[1, 0, p] = frames[q, 2, 2]
+    turns[1, 1, p] = sine
+    # from the two others, so that a frame hardly tilted keeps the sum of both turns about n
+    turns[0, 0, p] = frames[q, 1, 0] * b + frames[q, 1, 1] * a
+    turns[0, 1, p] = -frames[q, 0, 0] * b - frames[q, 0, 1] * a
+
+
+@leaf(fastmath=FAST)
+def _turn(turns, k, degrees, most, power, coefficients):
+    """Turn coefficients (terms, 3, points) about n in place, up to the order `most`; ``power`` (2, points) is scratch."""
+    for p in range(_GROUP):
+        power[0, p] = 1.0
+        power[1, p] = 0.0
     for m in range(1, min(degrees - 1, most) + 1):
-        turned = a * cosine - b * sine
-        b = a * sine + b * cosine
-        a = turned
-        x = np.float32(a)
-        y = np.float32(b)
+        for p in range(_GROUP):
+            a = power[0, p] * turns[k, 0, p] - power[1, p] * turns[k, 1, p]
+            power[1, p] = power[0, p] * turns[k, 1, p] + power[1, p] * turns[k, 0, p]
+            power[0, p] = a
         for l in range(m, degrees):  # noqa: E741
-            at = l * (l + 1)
-            for c in range(3):
-                even = coefficients[c, at + m]
-                odd = coefficients[c, at - m]
-                coefficients[c, at + m] = x * even - y * odd
-                coefficients[c, at - m] = y * even + x * odd
-
-
-@leaf(fastmath=FAST)
-def _put_aside(aside, way, coefficients, most, out):
-    """Turn coefficients (3, terms) by the blocks of one way; orders above `most` are not filled."""
-    degrees = int(math.sqrt(coefficients.shape[1]) + 0.5)
-    start = 0
-    for l in range(degrees):  # noqa: E741
-        size = 2 * l + 1
-        at = l * l
-        span = min(l, most)
-        for i in range(l - span, l + span + 1):
-            for c in range(3):
-                total = np.float32(0)
-                for j in range(size):
-                    total += aside[way, start + i * size + j] * coefficients[c, at + j]
-                out[c, at + i] = total
-        start += size * size
-
-
-@leaf(fastmath=FAST)
-def _couple(products, coefficients, light):
-    """Fill ``light`` (3, light terms) with the environment (3, terms) over the hemisphere."""
-    degrees = products.shape[1]
-    count = int(math.sqrt(light.shape[1]) + 0.5)
-    for l in range(count):  # noqa: E741
-        for m in range(-l, l + 1):
             i = l * (l + 1) + m
+            j = i - 2 * m
             for c in range(3):
-                total = np.float32(0)
-                for other in range(abs(m), degrees):
-                    total += products[i, other] * coefficients[c, other * (other + 1) + m]
-                light[c, i] = total
+                for p in range(_GROUP):
+                    even = coefficients[i, c, p]
+                    odd = coefficients[j, c, p]
+                    coefficients[i, c, p] = power[0, p] * even - power[1, p] * odd
+                    coefficients[j, c, p] = power[1, p] * even + power[0, p] * odd
+
+
+@leaf(fastmath=FAST)
+def _put_aside(first, columns, elements, degrees, most, coefficients, out):
+    """Fill ``out`` (terms, 3, points), up to the order `most`, with a quarter turn of the coefficients."""
+    for l in range(degrees):  # noqa: E741
+        span = min(l, most)
+        for i in range(l * (l + 1) - span, l * (l + 1) + span + 1):
+            for c in range(3):
+                for p in range(_GROUP):
+                    out[i, c, p] = np.float32(0)
+            for at in range(first[i], first[i + 1]):
+                element = elements[at]
+                j = columns[at]
+                for c in range(3):
+                    for p in range(_GROUP):
+                        out[i, c, p] += element * coefficients[j, c, p]
+
+
+@leaf(fastmath=FAST)
+def _couple(coupling, coefficients, light):
+    """Fill ``light`` (light terms, 3, points) with the environment over the hemisphere."""
+    degrees = coupling.shape[1]
+    i = 0
+    l = 0  # noqa: E741
+    while i < coupling.shape[0]:
+        for m in range(-l, l + 1):
+            for c in range(3):
+                for p in range(_GROUP):
+                    light[i, c, p] = np.float32(0)
+            for other in range(abs(m), degrees):
+                element = coupling[i, other]
+                j = other * (other + 1) + m
+                for c in range(3):
+                    for p in range(_GROUP):
+                        light[i, c, p] += element * coefficients[j, c, p]
+            i += 1
+        l += 1  # noqa: E741
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _shade(
-    codes, minimum, step, view_table, environment, aside, coupling,
+    codes, minimum, step, view_table, environment, quarters, coupling,
     rows, cols, toroidal, row, col, frames, w_o, visibility, out,
 ):  # fmt: skip
-    light_terms = coupling.shape[0]
-    most = int(math.sqrt(light_terms) + 0.5) - 1
-    every = coupling.shape[1]
+    first, columns, elements, first_back, columns_back, elements_back = quarters
+    terms = len(environment)
+    degrees = coupling.shape[1]
+    most = int(math.sqrt(len(coupling)) + 0.5) - 1
+    turns = np.empty((3, 2, _GROUP), np.float32)
+    power = np.empty((2, _GROUP), np.float32)
+    turned = np.empty((terms, 3, _GROUP), np.float32)
+    other = np.empty((terms, 3, _GROUP), np.float32)
+    lights = np.empty((len(coupling), 3, _GROUP), np.float32)
     view = np.empty(view_table.shape[0] ** 2, np.float32)
-    light = np.empty((3, light_terms), np.float32)
+    light = np.empty(len(coupling), np.float32)
     products = np.empty(minimum.shape[1], np.float32)
     weights = np.empty(minimum.shape, np.float32)
     base = np.empty(3, np.float32)
     texel = np.zeros(4, np.int64)
     share = np.zeros(4, np.float32)
-    turns = np.empty((3, 2))
-    turned = np.empty_like(environment)
-    other = np.empty_like(environment)
-    for q in range(len(row)):
-        same = q > 0
-        for i in range(3):
-            for j in range(3):
-                same = same and frames[q, i, j] == frames[q - 1, i, j]
-        if not same:  # flat parts share one frame
-            _angles(frames, q, turns)
-            turned[:] = environment
-            _turn(turns[2, 0], turns[2, 1], turned, every)
-            _put_aside(aside, 1, turned, every, other)
-            _turn(turns[1, 0], turns[1, 1], other, every)
-            _put_aside(aside, 0, other, most, turned)
-            _turn(turns[0, 0], turns[0, 1], turned, most)
-            _couple(coupling, turned, light)
-        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
-        fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
-        for c in range(3):
-            multiply(view, light[c], products)
-            weigh(products, minimum, step, c, weights, base)
-        contract(codes, texel, share, weights, base, q, out)
-        for c in range(3):
-            out[q, c] *= visibility[q]
+    for start in range(0, len(row), _GROUP):
+        for p in range(_GROUP):
+            _angles(frames, min(start + p, len(row) - 1), p, turns)
+        for i in range(terms):
+            for c in range(3):
+                turned[i, c, :] = environment[i, c]
+        _turn(turns, 2, degrees, degrees, power, turned)
+        _put_aside(first_back, columns_back, elements_back, degrees, degrees, turned, other)
+        _turn(turns, 1, degrees, degrees, power, other)
+        _put_aside(first, columns, elements, degrees, most, other, turned)
+        _turn(turns, 0, degrees, most, power, turned)
+        _couple(coupling, turned, lights)
+        for q in range(start, min(start + _GROUP, len(row))):
+            corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
+            fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
+            for c in range(3):
+                for i in range(len(light)):
+                    light[i] = lights[i, c, q - start]
+                multiply(view, light, products)
+                weigh(products, minimum, step, c, weights, base)
+            contract(codes, texel, share, weights, base, q, out)
+            for c in range(3):
+                out[q, c] *= visibility[q]

@@ -122,14 +122,15 @@ def test_equal_terms_of_light_and_sky_lose_what_a_sharp_sky_adds(model, rng):
     assert error[1] < 1e-5 < error[0]
 
 
-def test_repeated_frames_and_visibility(model, rng):
+def test_a_point_has_its_radiance_in_any_company_and_visibility_scales_it(model, rng):
     coefficients = rng.standard_normal((169, 3))
     environment = HarmonicEnvironment(model, coefficients)
-    frames = turns(rng, 4)[[3, 3, 0, 0, 3]]
-    row, col, w_o = np.arange(5) % 3, np.arange(5), np.tile([0, 0.6, 0.8], (5, 1))
-    alone = [shade(environment, row[[i]], col[[i]], frames[[i]], w_o[[i]])[0] for i in range(5)]
+    n = 19
+    frames = turns(rng, n)
+    row, col, w_o = np.arange(n) % 3, np.arange(n) % 5, np.tile([0, 0.6, 0.8], (n, 1))
+    alone = [shade(environment, row[[i]], col[[i]], frames[[i]], w_o[[i]])[0] for i in range(n)]
     np.testing.assert_array_equal(shade(environment, row, col, frames, w_o), alone)
-    visibility = np.array([0, 0.5, 1, 0.25, 1], np.float32)
+    visibility = np.linspace(0, 1, n).astype(np.float32)
     np.testing.assert_allclose(
         shade(environment, row, col, frames, w_o, visibility=visibility),
         alone * visibility[:, None],
