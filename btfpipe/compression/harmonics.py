@@ -28,7 +28,7 @@ _COLS = 32  # texels of a scan line worked on together; fixed, so that memory an
 _LANES = 16  # vectors whose lambda is sought together: a register's width
 _MOST_STEPS = 60
 _FULL_RANK = 1e-6  # singular values of Y below this share of the largest count as none
-_PROCESS_BYTES = 130 << 20  # Python and its libraries, before any work
+_PROCESS_BYTES = 140 << 20  # Python and its libraries, before any work
 
 
 class HarmonicsModel(Model):
@@ -300,43 +300,44 @@ def constrain(projected, values, eigenvalues, mirrored):
     """
     n, terms, m = projected.shape
     directions = values.shape[1]
-    energy = np.empty(_LANES, np.float32)
+    scale = np.empty(_LANES, np.float32)
     penalty = np.empty(_LANES, np.float32)
     square = np.empty(_LANES, np.float32)
     slope = np.empty(_LANES, np.float32)
     for v in range(n):
         for start in range(0, m, _LANES):
             lanes = min(_LANES, m - start)
-            energy[:] = 0.0
+            scale[:] = 0.0
             penalty[:] = 0.0
             for i in range(directions):
                 for j in range(lanes):
-                    energy[j] += values[v, i, start + j] * values[v, i, start + j]
+                    scale[j] += values[v, i, start + j] * values[v, i, start + j]
             for j in range(lanes):
-                energy[j] *= mirrored
+                # a vector of no energy has coefficients of 0 at any scale
+                scale[j] = 1 / np.sqrt(mirrored * scale[j]) if scale[j] > 0 else 0.0
             for _ in range(_MOST_STEPS):
                 square[:] = 0.0
                 slope[:] = 0.0
                 for i in range(terms):
                     for j in range(lanes):
                         share = np.float32(1.0) / (eigenvalues[i] + penalty[j])
-                        part = projected[v, i, start + j] * share
+                        part = projected[v, i, start + j] * share * scale[j]
                         part *= part
                         square[j] += part
                         slope[j] += part * share
                 moved = False
                 for j in range(lanes):
-                    if square[j] > energy[j] * np.float32(1.0001):
-                        penalty[j] += square[j] / slope[j] * (np.sqrt(square[j] / energy[j]) - 1)
+                    if square[j] > np.float32(1.0001):
+                        penalty[j] += square[j] / slope[j] * (np.sqrt(square[j]) - 1)
                         moved = True
                 if not moved:
                     break
             # Newton stops just above the energy: the last 0.005 % is a scale
             for j in range(lanes):
-                square[j] = np.sqrt(energy[j] / square[j]) if square[j] > energy[j] else 1.0
+                scale[j] = 1 / np.sqrt(square[j]) if square[j] > 1 else 1.0
             for i in range(terms):
                 for j in range(lanes):
-                    projected[v, i, start + j] *= square[j] / (eigenvalues[i] + penalty[j])
+                    projected[v, i, start + j] *= scale[j] / (eigenvalues[i] + penalty[j])
 
 
 class _Lines:
@@ -363,8 +364,8 @@ class _Lines:
         pairs = self.sample.n_pairs
         each = 12 * min(_COLS, self.cols) * (2 * pairs + 2 * self.terms[0] * self.lights)
         each += 8 * min(_COLS, self.cols) * all_terms
-        source = 3 if self.table is not None else 12
-        line = source * self.cols * pairs
+        # two bands: the next is read while the last is still held; values that are no 8-bit codes are decoded at once
+        line = 2 * self.cols * pairs * (3 if self.table is not None else 36)
         fixed = _PROCESS_BYTES + all_terms * texels
         need = fixed + line + each
         if need > memory:
@@ -380,8 +381,8 @@ class _Lines:
         self.kept = {} if free - line >= kept else None
         if self.kept is not None:
             free -= kept
-        # a band of an eighth of a gigabyte is read in long runs
-        self.band = max(1, min(free, 128 << 20) // line)
+        # bands of an eighth of a gigabyte are read in long runs
+        self.band = max(1, min(free, 256 << 20) // line)
 
     def _blocks(self, work):
         """Apply `work` to (values, row, cols) block by block and yield its results in order."""
@@ -438,19 +439,20 @@ class _Lines:
         energy = 0.0
 
         def work(values, row, cols):
+            square = _squares(values)
+            if not math.isfinite(square):
+                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
             coefficients = self._fit(values)
             if self.kept is not None:
                 self.kept[row, cols.start] = coefficients
             low, high = (np.empty(shape, np.float32) for _ in range(2))
             _range(coefficients.reshape(*self.terms, -1, 3), low, high)
-            return low, high, _squares(values)
+            return low, high, square
 
         for low, high, square in self._blocks(work):
             np.minimum(minimum, low, out=minimum)
             np.maximum(maximum, high, out=maximum)
             energy += square
-            if not math.isfinite(energy):
-                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
         return minimum, maximum, energy
 
     def quantise(self, minimum, maximum):
@@ -474,7 +476,8 @@ class _Lines:
 
 def _squares(values):
     """Sum of squares: rows in single precision, their sum in double."""
-    return float(np.vecdot(values, values).sum(dtype=np.float64))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
 @njit(cache=True, nogil=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe.compiled import leaf
+from btfpipe.compression.harmonics import HarmonicsModel
 from btfpipe.compression.harmonics_shading import FAST, HarmonicsShader, contract, multiply, weigh
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,
@@ -46,10 +47,15 @@ class HarmonicEnvironment:
     Raises
     ------
     InputError
-        Coefficients that are not finite, or not as many as a square number and as `terms`.
+        A Model of another method, coefficients that are not finite, or not as many as a square number and as `terms`.
     """
 
     def __init__(self, model, coefficients, terms=None):
+        if not isinstance(model, HarmonicsModel):
+            raise InputError(
+                f"light in the frequency domain needs a Model of method harmonics; this is"
+                f" {getattr(model, 'method', None) or 'a Sample'}."
+            )
         coefficients = np.asarray(coefficients, np.float64)
         if coefficients.ndim != 2 or coefficients.shape[1] != 3:
             raise InputError(
@@ -70,7 +76,7 @@ class HarmonicEnvironment:
         self.quarters = (*_quarter(terms, False), *_quarter(terms, True))
 
     def shade(self, row, col, frames, w_o, out, visibility=None):
-        """Radiance towards the eye.
+        """Radiance towards the eye; a little below 0 at places if the environment's own harmonics are.
 
         Parameters
         ----------

@@ -137,6 +137,15 @@ def test_no_vector_exceeds_its_energy_and_noise_reaches_it(rng):
     np.testing.assert_allclose(squares[0][bound], energy[0][bound], rtol=1e-4)
 
 
+def test_scaled_values_have_scaled_coefficients(rng):
+    values = rng.standard_normal((1, 81, 20)).astype(np.float32)
+    fit = _Fit(bonn81(), 36, "views", None)
+    plain = fit.apply(values)
+    for scale in (1e-12, 1e12):
+        found = fit.apply(values * np.float32(scale))
+        np.testing.assert_allclose(found / scale, plain, atol=2e-4 * np.abs(plain).max())
+
+
 def test_the_whole_is_that_of_a_loop_over_texels(rng):
     """Views first, then lights, a vector at a time, without codes."""
     sample = smooth_sample(rng, 2, 2, noise=0.02)
@@ -317,6 +326,7 @@ def test_bad_input_is_refused_by_name(make_sample):
     )  # fmt: skip
     with pytest.raises(InputError, match="method harmonics needs every view under every light"):
         compress_harmonics(some, 4, 9)
-    sample.codes[3, 1, 1, 0] = np.nan
-    with pytest.raises(InputError, match="non-finite"):
-        compress_harmonics(sample, 4, 9)
+    for bad in (np.nan, np.inf):
+        sample.codes[3, 1, 1, 0] = bad
+        with pytest.raises(InputError, match="non-finite"):
+            compress_harmonics(sample, 4, 9)

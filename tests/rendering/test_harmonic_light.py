@@ -148,3 +148,8 @@ def test_bad_environments_are_refused(model):
     ):
         with pytest.raises(InputError, match=message):
             HarmonicEnvironment(model, coefficients, terms)
+
+
+def test_only_models_of_harmonics_are_lit_so(make_sample):
+    with pytest.raises(InputError, match="method harmonics; this is a Sample"):
+        HarmonicEnvironment(make_sample(), np.ones((25, 3)))
