@@ -9,6 +9,8 @@ from btfpipe.sample import Sample
 # Where the Model of each method lives. A further method is one module and a line here.
 MODELS = {
     "svd": "btfpipe.compression.svd:SvdModel",
+    "view-pca": "btfpipe.compression.view_pca:ViewPcaModel",
+    "local-pca": "btfpipe.compression.local_pca:LocalPcaModel",
 }
 
 
