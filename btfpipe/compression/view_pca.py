@@ -16,7 +16,9 @@ from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.shading import PairWeights, corners
 
-_COLUMNS = 8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
+_COLUMNS = (
+    8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
+)
 _NOISE = 1e-6  # a singular value below this share of the view's norm is rounding
 
 
