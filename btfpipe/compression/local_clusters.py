@@ -10,6 +10,7 @@ import numpy as np
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
 _POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
+_STARTS = 3  # the best of so many: the outcome varies by some per cent with the first means
 _ROUNDS = 60
 _SETTLED = 2e-4  # the rounds end when the error falls by less than this share
 
@@ -45,27 +46,40 @@ def local_clusters(points, clusters, terms, *, given=None, seed=0, threads=1, on
     error : float
         Sum of squared distances of the points from what their clusters make of them.
     """
-    means = _first_means(points, clusters, np.random.default_rng(seed))
-    bases = [np.zeros((points.shape[1], 0), np.float32)] * clusters
-    error = np.inf
+    rng = np.random.default_rng(seed)
+    best = np.inf
     with single_threaded_blas():
-        labels, errors = _assign(points, means, bases, threads)
-        for turn in range(_ROUNDS):
-            _fill_empty(labels, errors, clusters)
-            now = min(turn // 2, terms)
-            means, bases = _fit(points, labels, clusters, now, threads)
-            before, last = labels, error
-            labels, errors = _assign(points, means, bases, threads)
-            error = float(errors.sum())
-            if on_progress is not None:
-                on_progress(turn + 1, _ROUNDS)
-            if now == terms and ((labels == before).all() or error > (1 - _SETTLED) * last):
-                break
-        _fill_empty(labels, errors, clusters)
+        for start in range(_STARTS if clusters > 1 else 1):
+
+            def report(turn, start=start):
+                if on_progress is not None:
+                    on_progress(start * _ROUNDS + turn + 1, _STARTS * _ROUNDS)
+
+            means = _first_means(points, clusters, rng)
+            found, error = _alternate(points, means, terms, threads, report)
+            if error < best:
+                labels, best = found, error
         bases = _fit(points, labels, clusters, terms if given is None else given, threads)[1]
     if on_progress is not None:
-        on_progress(_ROUNDS, _ROUNDS)
-    return labels, bases, float(errors.sum())
+        on_progress(_STARTS * _ROUNDS, _STARTS * _ROUNDS)
+    return labels, bases, best
+
+
+def _alternate(points, means, terms, threads, report):
+    """Fit and assign in turn until settled: labels (n,) and the sum of squared errors."""
+    clusters = len(means)
+    bases = [np.zeros((points.shape[1], 0), np.float32)] * clusters
+    error = np.inf
+    labels = _assign(points, means, bases, threads)[0]
+    for turn in range(_ROUNDS):
+        now = min(turn // 2, terms)
+        means, bases = _fit(points, labels, clusters, now, threads)
+        before, last = labels, error
+        labels, error = _assign(points, means, bases, threads)
+        report(turn)
+        if now == terms and ((labels == before).all() or error > (1 - _SETTLED) * last):
+            break
+    return labels, error
 
 
 def _first_means(points, clusters, rng):
@@ -89,7 +103,7 @@ def _first_means(points, clusters, rng):
 
 
 def _assign(points, means, bases, threads):
-    """The best cluster of each point, (n,) int32, and the squared error there, (n,) float64."""
+    """The best cluster of each point, (n,) int32, none left empty, and the sum of squared errors."""
     widths = np.array([basis.shape[1] for basis in bases])
     frame = np.concatenate([means.astype(np.float32).T, *bases], axis=1)
     offsets = [mean @ basis for mean, basis in zip(means, bases, strict=True)]
@@ -110,7 +124,9 @@ def _assign(points, means, bases, threads):
         return labels.astype(np.int32), np.maximum(errors[np.arange(len(some)), labels], 0)
 
     results = list(ordered_map(work, blocks(len(points), _POINTS), threads))
-    return tuple(np.concatenate(parts) for parts in zip(*results, strict=True))
+    labels, errors = (np.concatenate(parts) for parts in zip(*results, strict=True))
+    _fill_empty(labels, errors, clusters)
+    return labels, float(errors.sum())
 
 
 def _fill_empty(labels, errors, clusters):

@@ -6,6 +6,7 @@ sample is reduced by an SVD to 150 terms, the reduced texels of all samples are 
 PCA is then that of the original pictures, read in blocks.
 """
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -445,7 +446,7 @@ class _Passes:
         self.n_pairs = samples[0].n_pairs
         self.order = np.argsort(labels, kind="stable")
         ends = np.cumsum([0, *np.bincount(labels, minlength=clusters)])
-        self.parts = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         texels = len(labels)
         self.step = max(1, _DECODED_BYTES // (12 * texels))
         self.step = min(self.step, math.ceil(self.n_pairs / _GROUPS))

@@ -50,7 +50,9 @@ def noisy_sample(rng):
         codes = values.reshape(-1, rows, cols, 3)
         if dtype == np.uint8:
             codes = np.round(255 * np.clip(codes, 0, 1))
-        return Sample(codes.astype(dtype), lights, views, pair % n_lights, pair // n_lights, **kwargs)
+        return Sample(
+            codes.astype(dtype), lights, views, pair % n_lights, pair // n_lights, **kwargs
+        )
 
     return make
 
@@ -70,9 +72,7 @@ def test_each_view_is_its_best_approximation_of_that_rank(noisy_sample, componen
     components=st.integers(1, 10),
     seed=st.integers(0, 1000),
 )
-def test_any_small_sample_is_approximated_as_by_lapack(
-    shape, n_lights, n_views, components, seed
-):
+def test_any_small_sample_is_approximated_as_by_lapack(shape, n_lights, n_views, components, seed):
     codes = np.random.default_rng(seed).random((n_lights * n_views, *shape, 3), np.float32)
     pair = np.arange(len(codes))
     sample = Sample(
