@@ -12,13 +12,14 @@ from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 _POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
 _STARTS = 3  # the best of so many: the outcome varies by some per cent with the first means
 _ROUNDS = 60
+_OPENING = 16  # rounds in which the directions are let in
 _SETTLED = 2e-4  # the rounds end when the error falls by less than this share
 
 
 def local_clusters(points, clusters, terms, *, given=None, seed=0, threads=1, on_progress=None):
     """Divide points into clusters, each near its own mean and few principal directions.
 
-    The directions are let in one after the other, two rounds each: with all of them at once, the first, arbitrary
+    The directions are let in little by little over the first rounds: with all of them at once, the first, arbitrary
     clusters fit well enough to stay as they are.
 
     Parameters
@@ -72,7 +73,7 @@ def _alternate(points, means, terms, threads, report):
     error = np.inf
     labels = _assign(points, means, bases, threads)[0]
     for turn in range(_ROUNDS):
-        now = min(turn // 2, terms)
+        now = min(turn * max(8, terms) // _OPENING, terms)
         means, bases = _fit(points, labels, clusters, now, threads)
         before, last = labels, error
         labels, error = _assign(points, means, bases, threads)

@@ -19,6 +19,11 @@ from btfpipe.sample.shading import PairWeights, corners
 _COLUMNS = (
     8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
 )
+_TYPES = {  # of the mean and the eigen-textures
+    "half": (np.float16, np.float16),
+    "single": (np.float32, np.float32),
+    "byte": (np.float16, np.int8),
+}
 _NOISE = 1e-6  # a singular value below this share of the view's norm is rounding
 
 
@@ -29,50 +34,61 @@ class ViewPcaModel(Model):
 
     Parameters
     ----------
-    textures : (views, 1 + components, rows, cols, 3) float16 or float32
-        The mean and the eigen-textures, each scaled to a largest magnitude of 1, so that half precision holds
-        samples of any range.
+    means : (views, rows, cols, 3) float16 or float32
+        Scaled to a largest magnitude of 1, as are the textures: half precision then holds samples of any range.
+    textures : (views, components, rows, cols, 3) float16, float32, or int8 in steps of 1 / 127
+        Eigen-textures.
     weights : (views, lights, 1 + components) float32
-        With the scale of the textures inside.
+        Of the mean and of the textures as they are stored, their scale inside.
     source : Appearance
         Gives directions, index tables, toroidal, texels_per_mm; a product.
     """
 
     method = "view-pca"
 
-    def __init__(self, textures, weights, source, about=None):
-        super().__init__(textures.shape[2:4], source, about)
+    def __init__(self, means, textures, weights, source, about=None):
+        super().__init__(means.shape[1:3], source, about)
         self.require_product("per-view PCA")
+        self.means = means
         self.textures = textures
         self.weights = weights
 
     @property
     def n_terms(self):
         """Eigen-textures a view, the mean left out."""
-        return self.textures.shape[1] - 1
+        return self.textures.shape[1]
 
     def arrays(self):
-        return {"textures": self.textures, "weights": self.weights}
+        return {"means": self.means, "textures": self.textures, "weights": self.weights}
 
     @classmethod
     def from_arrays(cls, reader, source):
         views, lights = len(source.view_directions), len(source.light_directions)
-        textures = reader.require("textures", (views, None, None, None, 3), "f")
-        weights = reader.require("weights", (views, lights, textures.shape[1]), "f")
-        return cls(textures, weights, source, reader.about)
+        means = reader.require("means", (views, None, None, 3), "f")
+        textures = reader.require("textures", (views, None, *means.shape[1:]), "fi")
+        weights = reader.require("weights", (views, lights, 1 + textures.shape[1]), "f")
+        return cls(means, textures, weights, source, reader.about)
+
+    def terms(self, view):
+        """Mean and eigen-textures (1 + components, texels, 3) float32 of a view, as the weights expect them."""
+        mean = np.asarray(self.means[view], np.float32)[None]
+        terms = np.concatenate([mean, np.asarray(self.textures[view], np.float32)])
+        return terms.reshape(len(terms), -1, 3)
 
     def pictures(self, pairs):
         views, lights = self.view_index[pairs], self.light_index[pairs]
         out = np.empty((len(views), 3 * self.shape[0] * self.shape[1]), np.float32)
         for view in np.unique(views):
             chosen = np.flatnonzero(views == view)
-            textures = np.asarray(self.textures[view], np.float32).reshape(1 + self.n_terms, -1)
-            out[chosen] = np.asarray(self.weights[view][lights[chosen]]) @ textures
+            terms = self.terms(view)
+            out[chosen] = self.weights[view][lights[chosen]] @ terms.reshape(len(terms), -1)
         return out.reshape(-1, *self.shape, 3)
 
     def texels(self, rows, cols):
-        textures = np.asarray(self.textures[:, :, rows, cols], np.float32)
-        values = np.asarray(self.weights) @ textures.reshape(*textures.shape[:2], -1)
+        means = np.asarray(self.means[:, rows, cols], np.float32)[:, None]
+        terms = np.asarray(self.textures[:, :, rows, cols], np.float32)
+        terms = np.concatenate([means, terms], axis=1)
+        values = np.asarray(self.weights) @ terms.reshape(*terms.shape[:2], -1)
         return np.ascontiguousarray(values.reshape(self.n_pairs, -1, 3).swapaxes(0, 1))
 
     def shader(self, interpolation="barycentric"):
@@ -99,7 +115,7 @@ def compress_view_pca(
         Eigen-textures a view, at least 1. The lights of a view, less its mean, have at most lights - 1; terms
         that are rounding noise in every view are left out too.
     precision : str
-        Of the textures: ``half`` or ``single``.
+        Of the pictures: ``half``, ``single``, or ``byte``, which keeps the mean in half precision.
     seed : int
         Not needed: nothing is random. Taken as by other methods.
     threads : int
@@ -122,24 +138,29 @@ def compress_view_pca(
     InputError
         Not a product, no components, non-finite pictures, or too little memory.
     """
-    if precision not in ("half", "single"):
-        raise InputError(f"precision {precision!r}; expected half or single.")
+    if precision not in _TYPES:
+        raise InputError(f"precision {precision!r}; expected half, single or byte.")
     if components < 1:
         raise InputError(f"{components} components asked for; expected at least 1.")
     sample.require_product("per-view PCA")
     lights, views = len(sample.light_directions), len(sample.view_directions)
     texels = sample.shape[0] * sample.shape[1]
     kept = min(components, lights - 1, 3 * texels)
-    dtype = np.float16 if precision == "half" else np.float32
-    threads = _views_at_once(lights, views, texels, kept, np.dtype(dtype).itemsize, threads, memory)
-    textures = np.empty((views, 1 + kept, *sample.shape, 3), dtype)
+    means = np.empty((views, *sample.shape, 3), _TYPES[precision][0])
+    textures = np.empty((views, kept, *sample.shape, 3), _TYPES[precision][1])
+    step = 127 if precision == "byte" else 1
+    size = means.nbytes + textures.nbytes
+    threads = _views_at_once(lights, views, texels, kept, size, threads, memory)
     weights = np.empty((views, lights, 1 + kept), np.float32)
 
     def work(view):
         pairs = slice(view * lights, (view + 1) * lights)
         values = planar_pictures(sample, pairs).reshape(lights, -1)
         terms, weights[view], rank = _view_terms(values, kept)
-        textures[view] = terms.reshape(-1, 3, *sample.shape).transpose(0, 2, 3, 1)
+        terms = terms.reshape(-1, 3, *sample.shape).transpose(0, 2, 3, 1)
+        means[view] = terms[0]
+        textures[view] = np.round(terms[1:] * step) if step > 1 else terms[1:]
+        weights[view, :, 1:] /= step
         return view, rank
 
     most = 0
@@ -155,8 +176,8 @@ def compress_view_pca(
             f"the views have at most {most} terms beside their mean: {components - most} of the"
             f" {components} components left out"
         )
-        textures, weights = textures[:, : 1 + most].copy(), weights[:, :, : 1 + most].copy()
-    model = ViewPcaModel(textures, weights, sample)
+        textures, weights = textures[:, :most].copy(), weights[:, :, : 1 + most].copy()
+    model = ViewPcaModel(means, textures, weights, sample)
     error = measured_error(
         model,
         sample,
@@ -173,9 +194,9 @@ def compress_view_pca(
     return model
 
 
-def _views_at_once(lights, views, texels, terms, item_bytes, threads, memory):
+def _views_at_once(lights, views, texels, terms, model_bytes, threads, memory):
     """How many views fit the memory, at most `threads`."""
-    fixed = _PROCESS_BYTES + views * (1 + terms) * 3 * texels * item_bytes
+    fixed = _PROCESS_BYTES + model_bytes
     # the values and a copy on the way to them; the mean in double precision; the terms twice
     each = 12 * texels * (2 * lights + 2 + 2 * (1 + terms)) + 16 * lights * _COLUMNS
     if fixed + each > memory:
@@ -248,12 +269,11 @@ class ViewPcaShader:
         self.pairs = PairWeights(model, interpolation)
         self.rows, self.cols = model.shape
         self.toroidal = model.toroidal
-        views, terms = model.textures.shape[:2]
+        views, terms = len(model.means), 1 + model.n_terms
         # the terms of a texel and view lie together; single precision, as the processor computes in no other
         self.textures = np.empty((self.rows * self.cols, views, 3 * terms), np.float32)
         for view in range(views):
-            textures = np.asarray(model.textures[view]).reshape(terms, -1, 3)
-            self.textures[:, view] = textures.swapaxes(0, 1).reshape(-1, 3 * terms)
+            self.textures[:, view] = model.terms(view).swapaxes(0, 1).reshape(-1, 3 * terms)
         self.weights = np.ascontiguousarray(model.weights, np.float32).reshape(-1, terms)
         self.lights = model.weights.shape[1]
 

@@ -115,8 +115,8 @@ def test_threads_and_memory_never_show(noisy_sample):
         for threads, memory in ((1, 2 << 30), (2, 2 << 30), (3, 108 << 20))
     ]
     for model in models[1:]:
-        assert model.textures.tobytes() == models[0].textures.tobytes()
-        assert model.weights.tobytes() == models[0].weights.tobytes()
+        for name, array in model.arrays().items():
+            assert array.tobytes() == models[0].arrays()[name].tobytes(), name
         assert model.about == models[0].about
 
 
@@ -138,6 +138,22 @@ def test_terms_that_are_only_rounding_are_left_out(rng):
     model = compress_view_pca(sample, 6, precision="single")
     assert model.n_terms == 2
     np.testing.assert_allclose(views_of(model), views_of(sample), atol=1e-6)
+
+
+def test_bytes_take_less_and_cost_little_more_than_their_rounding(noisy_sample):
+    sample = noisy_sample(30, 31)
+    half, byte = (compress_view_pca(sample, 5, precision=p) for p in ("half", "byte"))
+    assert byte.textures.nbytes == half.textures.nbytes / 2
+    # each texture is off by up to half a step of 1 / 127 of its largest magnitude, evenly spread
+    steps = np.abs(half.weights[..., 1:].astype(float)) / 127
+    rounding = (steps**2).mean(axis=(0, 1)).sum() / 12
+    expected = np.sqrt(half.about["rmse"] ** 2 + rounding)
+    assert byte.about["rmse"] == pytest.approx(expected, rel=0.002)
+    assert byte.about["rmse"] > half.about["rmse"]
+    back = compress_view_pca(sample, 12, precision="byte")
+    bound = 0.5 * np.abs(back.weights[..., 1:]).sum(axis=2).reshape(-1, 1) + 2e-3
+    error = np.abs(views_of(back) - views_of(sample)).reshape(sample.n_pairs, -1)
+    assert (error <= bound).all()
 
 
 def test_half_precision_holds_values_beyond_its_range(noisy_sample):
@@ -171,14 +187,16 @@ def test_texels_pictures_and_file_agree(noisy_sample, tmp_path):
     np.testing.assert_allclose(
         back.texels(rows, cols), pictures[:, rows, cols].swapaxes(0, 1), atol=1e-6
     )
-    stored = sum(array.nbytes for array in (back.textures, back.weights))
+    stored = sum(array.nbytes for array in (back.means, back.textures, back.weights))
     assert stored <= back.nbytes <= (tmp_path / "m.npz").stat().st_size
 
 
 @pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
 @pytest.mark.parametrize("toroidal", [True, False])
 def test_the_shader_is_the_formula(noisy_sample, rng, toroidal, interpolation):
-    model = compress_view_pca(noisy_sample(n_views=7, toroidal=toroidal), 3)
+    precision = "byte" if toroidal else "half"
+    sample = noisy_sample(n_views=7, toroidal=toroidal)
+    model = compress_view_pca(sample, 3, precision=precision)
     n = 50
     row, col = rng.uniform(-12, 20, (2, n))
     w_i, w_o = (from_angles(rng.uniform(0, 1.7, n), rng.uniform(0, 6.3, n)) for _ in range(2))
@@ -219,7 +237,7 @@ def test_fewer_components_than_one_are_refused(noisy_sample, components):
 
 def test_bad_input_is_refused_by_name(noisy_sample):
     sample = noisy_sample()
-    with pytest.raises(InputError, match="expected half or single"):
+    with pytest.raises(InputError, match="expected half, single or byte"):
         compress_view_pca(sample, precision="quarter")
     with pytest.raises(InputError, match=r"need \d+ MB; --memory allows 32 MB"):
         compress_view_pca(sample, memory=32 << 20)
