@@ -25,6 +25,11 @@ DEFAULT_RATIO = 54
 _REDUCED_TERMS = 150
 _JOINT_TERMS = 512  # of several samples together
 _OVERSAMPLING = 6
+_TYPES = {  # of the bases and the coordinates
+    "half": (np.dtype(np.float16), np.dtype(np.float16)),
+    "single": (np.dtype(np.float32), np.dtype(np.float32)),
+    "byte": (np.dtype(np.int8), np.dtype(np.float16)),
+}
 _GROUPS = 32  # partial sums a pass, added in order; fixed, so that threads and memory never show
 _DECODED_BYTES = 6 << 20  # linear pictures in a thread's hands; fixed, as sums hang on it
 _NOISE = 1e-6  # a singular value below this share of its cluster's norm is rounding
@@ -41,9 +46,10 @@ class LocalPcaModel(Model):
 
     Parameters
     ----------
-    bases : (clusters, pairs, 3, 1 + terms) float16 or float32
+    bases : (clusters, pairs, 3, 1 + terms) float16, float32 or int8
         The mean of the cluster, then its principal vectors.
     coordinates : (texels of all materials, terms) float16 or float32
+        At most 1 in magnitude, so that the bases are of the size of the values.
     labels : (texels of all materials,) unsigned int
         Cluster of each texel, material by material, row by row.
     materials : list of dict
@@ -54,15 +60,20 @@ class LocalPcaModel(Model):
         Facts for the file.
     chosen : int
         The material that is evaluated.
+    scales : (clusters, pairs) float16, optional
+        What bases in bytes are multiplied by.
     """
 
     method = "local-pca"
 
-    def __init__(self, bases, coordinates, labels, materials, source, about=None, chosen=0):
+    def __init__(
+        self, bases, coordinates, labels, materials, source, about=None, chosen=0, scales=None
+    ):
         facts = {name: materials[chosen][name] for name in _FACTS}
         tables = {name: getattr(source, name) for name in _DIRECTIONS}
         super().__init__(materials[chosen]["shape"], SimpleNamespace(**facts, **tables), about)
         self.bases = bases
+        self.scales = scales
         self.coordinates = coordinates
         self.labels = labels
         self.about |= {"materials": materials, "material": chosen}
@@ -101,12 +112,14 @@ class LocalPcaModel(Model):
                 f"no material {which!r}; the database holds {len(names)}: {', '.join(names)}."
             )
         return type(self)(
-            self.bases, self.coordinates, self.labels, self.about["materials"], self, self.about, int(index)
+            self.bases, self.coordinates, self.labels, self.about["materials"], self, self.about,
+            int(index), self.scales,
         )  # fmt: skip
 
     def arrays(self):
         """Of the whole database, whichever material is evaluated; so is `nbytes`."""
-        return {"bases": self.bases, "coordinates": self.coordinates, "labels": self.labels}
+        arrays = {"bases": self.bases, "coordinates": self.coordinates, "labels": self.labels}
+        return arrays if self.scales is None else arrays | {"scales": self.scales}
 
     @classmethod
     def from_arrays(cls, reader, source):
@@ -125,13 +138,14 @@ class LocalPcaModel(Model):
         texels = sum(math.prod(fact["shape"]) for fact in materials)
         coordinates = reader.require("coordinates", (texels, None), "f")
         shape = (None, len(source.light_index), 3, 1 + coordinates.shape[1])
-        bases = reader.require("bases", shape, "f")
+        bases = reader.require("bases", shape, "fi")
+        scales = reader.require("scales", bases.shape[:2], "f") if "scales" in reader else None
         labels = reader.require("labels", (texels,), "u")
         if texels and labels.max() >= len(bases):
             raise InputError(
                 f"{reader.path}: labels reach {labels.max()}; expected less than {len(bases)} clusters."
             )
-        return cls(bases, coordinates, labels, materials, source, about, chosen)
+        return cls(bases, coordinates, labels, materials, source, about, chosen, scales)
 
     def _range(self):
         """Slice of the material's texels."""
@@ -144,11 +158,18 @@ class LocalPcaModel(Model):
         own = self._range()
         return np.asarray(self.coordinates[own], np.float32), np.asarray(self.labels[own], np.int32)
 
+    def bases_of(self, index):
+        """Bases float32 of an index into clusters, or into clusters and pairs."""
+        bases = np.array(self.bases[index], np.float32, order="C")
+        if self.scales is not None:
+            bases *= np.asarray(self.scales[index], np.float32)[..., None, None]
+        return bases
+
     def pictures(self, pairs):
         from btfpipe.compression.local_shading import fill_pictures
 
         coordinates, labels = self.own_texels()
-        bases = np.ascontiguousarray(self.bases[:, pairs], np.float32)
+        bases = self.bases_of((slice(None), pairs))
         out = np.empty((bases.shape[1], len(labels), 3), np.float32)
         fill_pictures(coordinates, labels, bases, out)
         return out.reshape(-1, *self.shape, 3)
@@ -162,7 +183,7 @@ class LocalPcaModel(Model):
         out = np.empty((len(index), self.n_pairs, 3), np.float32)
         for cluster in np.unique(labels):
             own = np.flatnonzero(labels == cluster)
-            basis = np.asarray(self.bases[cluster], np.float32)
+            basis = self.bases_of(cluster)
             out[own] = np.tensordot(coordinates[own], basis[..., 1:], (1, 2)) + basis[..., 0]
         return out
 
@@ -196,11 +217,12 @@ def compress_local_pca(
     components : int
         Principal vectors a cluster beside its mean, at least 1; no more are made than the largest cluster has.
     target_bytes : int, optional
-        Size to stay within. A cluster takes ``3 * pairs * (1 + components)`` numbers, a texel `components` numbers and its
+        Size to stay within. A cluster takes ``3 * pairs * (1 + components)`` numbers (and `pairs` scales), a texel `components` numbers and its
         cluster. By default a 54th of the pictures at 3 bytes a texel and pair: 16 clusters for one sample of
-        128 x 128 texels and 81 x 81 directions.
+        128 x 128 texels and 81 x 81 directions, in half precision.
     precision : str
-        Of the numbers: ``half`` or ``single``.
+        Of the numbers: ``half``, ``single``, or ``byte``: bases in bytes that are scaled for each cluster and pair,
+        coordinates in half precision.
     names : sequence of str, optional
         Of the materials; by default ``material 0`` and so on.
     seed : int
@@ -233,14 +255,13 @@ def compress_local_pca(
         raise InputError(
             f"{len(samples)} samples have {len(set(names))} different names; expected one each."
         )
-    if precision not in ("half", "single"):
-        raise InputError(f"precision {precision!r}; expected half or single.")
+    if precision not in _TYPES:
+        raise InputError(f"precision {precision!r}; expected half, single or byte.")
     if components < 1:
         raise InputError(f"{components} components asked for; expected at least 1.")
     _require_equal_directions(samples, names)
     pairs = samples[0].n_pairs
-    dtype = np.dtype(np.float16 if precision == "half" else np.float32)
-    clusters = _cluster_count(samples, clusters, components, target_bytes, dtype.itemsize)
+    clusters = _cluster_count(samples, clusters, components, target_bytes, precision)
     progress = _Progress(on_progress, pairs * (6 * len(samples) + 1))
 
     points = _reduced(samples, names, seed, threads, memory, progress)
@@ -248,13 +269,13 @@ def compress_local_pca(
         points, clusters, components,
         given=components + _OVERSAMPLING, seed=seed, threads=threads, on_progress=progress.part(pairs),
     )  # fmt: skip
-    passes = _Passes(samples, labels, clusters, components, dtype, threads, memory, progress)
+    passes = _Passes(samples, labels, clusters, components, precision, threads, memory, progress)
     with single_threaded_blas():
         frames = passes.frames(points, directions)
         del points, directions
-        frames, singular = passes.improve(frames, components)
-        bases, coordinates = passes.project(frames, singular, components)
-    most = max(len(values) for values in singular)
+        frames = passes.improve(frames, components)
+        bases, scales, coordinates = passes.project(frames, components)
+    most = max(frame.shape[1] for frame in frames) - 1
     warnings = []
     if most < components:
         warnings.append(
@@ -273,7 +294,7 @@ def compress_local_pca(
         for name, sample in zip(names, samples, strict=True)
     ]
     labels = labels.astype(np.min_scalar_type(clusters - 1))
-    model = LocalPcaModel(bases, coordinates, labels, materials, samples[0])
+    model = LocalPcaModel(bases, coordinates, labels, materials, samples[0], scales=scales)
     for index, (sample, facts) in enumerate(zip(samples, materials, strict=True)):
         facts |= measured_error(
             model.material(index), sample, threads=threads, on_progress=progress.part(pairs)
@@ -334,7 +355,7 @@ _PLURALS = {
 }
 
 
-def _cluster_count(samples, clusters, components, target_bytes, item_bytes):
+def _cluster_count(samples, clusters, components, target_bytes, precision):
     """How many clusters, as asked for or as the bytes allow."""
     pairs = samples[0].n_pairs
     texels = sum(sample.shape[0] * sample.shape[1] for sample in samples)
@@ -348,8 +369,9 @@ def _cluster_count(samples, clusters, components, target_bytes, item_bytes):
         return clusters
     first = samples[0]
     fixed = sum(getattr(first, table).nbytes for table in _DIRECTIONS[:2])
-    fixed += texels * (components * item_bytes + 1)
-    each = 3 * pairs * (1 + components) * item_bytes
+    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
+    fixed += texels * (components * coordinate + 1)
+    each = pairs * (3 * (1 + components) * basis + (2 if precision == "byte" else 0))
     # more clusters than this have texels to themselves
     most = max(1, texels // (1 + components))
     if target_bytes is None:
@@ -441,8 +463,9 @@ class _Passes:
     to the constant, centred sums.
     """
 
-    def __init__(self, samples, labels, clusters, components, dtype, threads, memory, progress):
-        self.samples, self.dtype, self.progress = samples, dtype, progress
+    def __init__(self, samples, labels, clusters, components, precision, threads, memory, progress):
+        self.samples, self.progress = samples, progress
+        self.dtypes = _TYPES[precision]
         self.n_pairs = samples[0].n_pairs
         self.order = np.argsort(labels, kind="stable")
         ends = np.cumsum([0, *np.bincount(labels, minlength=clusters)])
@@ -454,7 +477,9 @@ class _Passes:
         fixed = (
             _PROCESS_BYTES + 3 * 4 * width * texels
         )  # frames, the sum, and one in double precision
-        fixed += dtype.itemsize * (3 * self.n_pairs * clusters + texels) * (1 + components)
+        fixed += (1 + components) * (
+            3 * self.n_pairs * clusters * self.dtypes[0].itemsize + texels * self.dtypes[1].itemsize
+        )
         each = 4 * width * texels + 3 * 12 * self.step * texels
         if fixed + each > memory:
             raise InputError(
@@ -500,9 +525,8 @@ class _Passes:
 
         Returns
         -------
-        frames : list of (texels, 1 + terms or fewer) float32
-            Of the best `components` directions in the span of each given frame, once more multiplied by ``A A^T``.
-        singular : list of (terms or fewer,) float64
+        list of (texels, 1 + components or fewer) float32
+            Frames of the best directions in the span of each given frame, once more multiplied by ``A A^T``.
         """
         widths = [frame.shape[1] for frame in frames]
         image = np.zeros((len(self.order), max(widths) - 1), np.float32)
@@ -523,41 +547,51 @@ class _Passes:
             image += sums
             for gram, square in zip(grams, squares, strict=True):
                 gram += square
-        improved, singular = [], []
+        improved = []
         for part, gram in zip(self.parts, grams, strict=True):
             values, turn = np.linalg.eigh(gram[1:, 1:])
             values, turn = values[::-1][:components], turn[:, ::-1][:, :components]
             kept = values > _NOISE**2 * np.trace(gram)
             improved.append(_frame(image[part, : len(gram) - 1] @ turn[:, kept]))
-            singular.append(np.sqrt(values[kept]))
-        return improved, singular
+        return improved
 
-    def project(self, frames, singular, components):
-        """Bases and coordinates, in the order of the texels, each with the root of the singular values."""
-        bases = np.zeros((len(self.parts), self.n_pairs, 3, 1 + components), self.dtype)
-        coordinates = np.zeros((len(self.order), components), self.dtype)
+    def project(self, frames, components):
+        """Bases, their scales (None unless in bytes), and coordinates in the order of the texels."""
+        bases = np.zeros((len(self.parts), self.n_pairs, 3, 1 + components), self.dtypes[0])
+        scales = None
+        if bases.dtype == np.int8:
+            scales = np.zeros(bases.shape[:2], np.float16)
+        coordinates = np.zeros((len(self.order), components), self.dtypes[1])
         scaled = []
-        for part, frame, values in zip(self.parts, frames, singular, strict=True):
-            root = np.sqrt(values)
-            own = (frame[:, 1:] * root).astype(np.float32)
-            _require_range(
-                self.dtype, own.max(initial=0, keepdims=True), own.min(initial=0, keepdims=True)
-            )
-            coordinates[self.order[part], : len(values)] = own
-            scale = np.concatenate([[1 / math.sqrt(len(frame))], 1 / root])
-            scaled.append((frame * scale).astype(np.float32))
+        for part, frame in zip(self.parts, frames, strict=True):
+            # coordinates of largest magnitude 1; `A^T` of the constant column is the mean times the root of n
+            largest = np.abs(frame[:, 1:]).max(axis=0, initial=0)
+            coordinates[self.order[part], : len(largest)] = frame[:, 1:] / largest
+            scaled.append(frame * np.append(np.float32(1 / math.sqrt(len(frame))), largest))
 
         def work(steps):
             for pairs in steps:
                 values = self._values(pairs)
                 for cluster, (part, frame) in enumerate(zip(self.parts, scaled, strict=True)):
-                    weights = (values[:, part] @ frame).reshape(-1, 3, frame.shape[1])
-                    _require_range(self.dtype, weights)
-                    bases[cluster, pairs, :, : frame.shape[1]] = weights
+                    found = (values[:, part] @ frame).reshape(-1, 3, frame.shape[1])
+                    if scales is None:
+                        _require_range(bases.dtype, found)
+                    else:
+                        found, scales[cluster, pairs] = _bytes(found)
+                    bases[cluster, pairs, :, : frame.shape[1]] = found
 
         for _ in self._groups(work):
             pass
-        return bases, coordinates
+        return bases, scales, coordinates
+
+
+def _bytes(values):
+    """Values (pairs, 3, n) in whole steps, -127 to 127, and the size of each pair's step, float16."""
+    largest = np.abs(values).max(axis=(1, 2))
+    _require_range(np.float16, largest / 127)
+    steps = (largest / 127).astype(np.float16)
+    size = np.where(steps > 0, steps, np.inf).astype(np.float32)[:, None, None]
+    return np.clip(np.round(values / size), -127, 127), steps
 
 
 def _frame(columns):

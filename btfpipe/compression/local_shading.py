@@ -30,8 +30,7 @@ class LocalPcaShader:
         self.rows, self.cols = model.shape
         self.toroidal = model.toroidal
         self.coordinates, self.labels = model.own_texels()
-        bases = model.bases
-        self.bases = np.ascontiguousarray(bases, np.float32).reshape(*bases.shape[:2], -1)
+        self.bases = model.bases_of(slice(None)).reshape(model.n_clusters, model.n_pairs, -1)
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""

@@ -237,7 +237,8 @@ def test_texels_and_pictures_agree(patchy_sample):
 @pytest.mark.parametrize("toroidal", [True, False])
 def test_the_shader_blends_values_across_clusters(patchy_sample, rng, toroidal, interpolation):
     samples = [patchy_sample(), patchy_sample((6, 9), noise=0.3, toroidal=toroidal)]
-    model = compress_local_pca(samples, clusters=9, components=3).material(1)
+    precision = "byte" if toroidal else "half"
+    model = compress_local_pca(samples, clusters=9, components=3, precision=precision).material(1)
     labels = model.own_texels()[1].reshape(model.shape)
     assert (labels[:, 1:] != labels[:, :-1]).any()
     n = 60
@@ -298,7 +299,7 @@ def test_by_default_clusters_are_as_many_as_in_the_paper():
         sample = SimpleNamespace(
             shape=(texels, texels), n_pairs=directions**2, light_directions=table, view_directions=table
         )  # fmt: skip
-        return _cluster_count([sample] * materials, None, 8, None, 2)
+        return _cluster_count([sample] * materials, None, 8, None, "half")
 
     assert count(1, 128, 81) == 16
     assert abs(count(15, 128, 151) - 250) <= 5
@@ -319,6 +320,34 @@ def test_a_black_sample_becomes_a_black_model(patchy_sample):
     model = compress_local_pca([sample, sample], clusters=4)
     assert not matrix(model).any()
     assert model.about["rmse"] == model.about["relative_error"] == 0
+
+
+def test_bytes_take_less_and_cost_little_more_than_their_rounding(patchy_sample, tmp_path):
+    sample = patchy_sample(shape=(20, 20), noise=0.1)
+    single, byte = (
+        compress_local_pca(sample, clusters=4, components=5, precision=p)
+        for p in ("single", "byte")
+    )
+    np.testing.assert_array_equal(byte.labels, single.labels)
+    assert byte.bases.nbytes == single.bases.nbytes / 4
+    # each number of a basis is off by up to half a step, evenly spread, times a coordinate
+    squares = 1 + np.square(byte.coordinates.astype(float)).sum(axis=1)
+    steps = byte.scales.astype(float)[byte.labels]
+    rounding = (squares[:, None] * steps**2).mean() / 12
+    expected = np.sqrt(single.about["rmse"] ** 2 + rounding)
+    assert byte.about["rmse"] == pytest.approx(expected, rel=0.002)
+    byte.save(tmp_path / "m.npz")
+    back = open_appearance(tmp_path / "m.npz")
+    np.testing.assert_array_equal(matrix(back), matrix(byte))
+    rows, cols = np.array([0, 3, 7]), np.array([1, 6, 2])
+    np.testing.assert_allclose(
+        back.texels(rows, cols).reshape(3, -1), matrix(byte)[rows * 20 + cols], atol=1e-5
+    )
+    target = byte.nbytes
+    assert (
+        compress_local_pca(sample, components=5, target_bytes=target, precision="byte").n_clusters
+        == 4
+    )
 
 
 def test_a_list_of_pairs_is_compressed_but_not_shaded(patchy_sample):
@@ -357,7 +386,7 @@ def test_bad_input_is_refused_by_name(patchy_sample):
         ({"clusters": 0}, "0 clusters asked for; expected at least 1"),
         ({"components": 0}, "0 components asked for; expected at least 1"),
         ({"clusters": 2, "target_bytes": 10**6}, "expected one of them"),
-        ({"precision": "quarter"}, "expected half or single"),
+        ({"precision": "quarter"}, "expected half, single or byte"),
         ({"names": ["a", "b"]}, "1 samples have 2 different names"),
         ({"memory": 32 << 20}, r"need \d+ MB; --memory allows 32 MB"),
     ):
