@@ -217,9 +217,9 @@ def compress_local_pca(
     components : int
         Principal vectors a cluster beside its mean, at least 1; no more are made than the largest cluster has.
     target_bytes : int, optional
-        Size to stay within. A cluster takes ``3 * pairs * (1 + components)`` numbers (and `pairs` scales), a texel `components` numbers and its
-        cluster. By default a 54th of the pictures at 3 bytes a texel and pair: 16 clusters for one sample of
-        128 x 128 texels and 81 x 81 directions, in half precision.
+        Size to stay within. A cluster takes ``3 * pairs * (1 + components)`` numbers (and a scale for each pair, in
+        bytes), a texel `components` numbers and its cluster. By default a 54th of the pictures at 3 bytes a texel
+        and pair: 16 clusters for one sample of 128 x 128 texels and 81 x 81 directions, in half precision.
     precision : str
         Of the numbers: ``half``, ``single``, or ``byte``: bases in bytes that are scaled for each cluster and pair,
         coordinates in half precision.
@@ -262,6 +262,7 @@ def compress_local_pca(
     _require_equal_directions(samples, names)
     pairs = samples[0].n_pairs
     clusters = _cluster_count(samples, clusters, components, target_bytes, precision)
+    plan = _plan(samples, clusters, components, precision, threads, memory)
     progress = _Progress(on_progress, pairs * (6 * len(samples) + 1))
 
     points = _reduced(samples, names, seed, threads, memory, progress)
@@ -269,7 +270,7 @@ def compress_local_pca(
         points, clusters, components,
         given=components + _OVERSAMPLING, seed=seed, threads=threads, on_progress=progress.part(pairs),
     )  # fmt: skip
-    passes = _Passes(samples, labels, clusters, components, precision, threads, memory, progress)
+    passes = _Passes(samples, labels, clusters, precision, plan, progress)
     with single_threaded_blas():
         frames = passes.frames(points, directions)
         del points, directions
@@ -387,6 +388,35 @@ def _cluster_count(samples, clusters, components, target_bytes, precision):
     return int(min(count, most))
 
 
+def _plan(samples, clusters, components, precision, threads, memory):
+    """Pairs decoded at a time, groups of them at once, and threads, so that all stays within the memory.
+
+    Only the first has a part in the result, and it depends on the samples alone.
+    """
+    pairs, texels = samples[0].n_pairs, sum(math.prod(sample.shape) for sample in samples)
+    step = max(1, _DECODED_BYTES // (12 * texels))
+    step = min(step, math.ceil(pairs / _GROUPS))
+    width = components + _OVERSAMPLING
+    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
+    # frames, the sum, and one in double precision; the answer
+    fixed = _PROCESS_BYTES + 4 * 4 * width * texels
+    fixed += (1 + components) * (3 * pairs * clusters * basis + texels * coordinate)
+    each = 4 * width * texels + 3 * 12 * step * texels  # a partial sum; pictures being decoded
+    # before that: what the samples are reduced to, and points made of it
+    reduced = _PROCESS_BYTES + 4 * min(_REDUCED_TERMS, texels) * (
+        2 * texels + 3 * pairs * len(samples)
+    )
+    need = max(fixed + each, reduced)
+    if need > memory:
+        raise InputError(
+            f"{clusters} clusters of {components} components and {texels} texels need"
+            f" {math.ceil(need / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
+            " or ask for fewer clusters."
+        )
+    at_once = int(min((memory - fixed) // each, 2 * threads))
+    return step, at_once, min(threads, at_once)
+
+
 class _Progress:
     """Reports stages of known weight, each with its own idea of a total, as one."""
 
@@ -463,32 +493,14 @@ class _Passes:
     to the constant, centred sums.
     """
 
-    def __init__(self, samples, labels, clusters, components, precision, threads, memory, progress):
+    def __init__(self, samples, labels, clusters, precision, plan, progress):
         self.samples, self.progress = samples, progress
+        self.step, self.at_once, self.threads = plan
         self.dtypes = _TYPES[precision]
         self.n_pairs = samples[0].n_pairs
         self.order = np.argsort(labels, kind="stable")
         ends = np.cumsum([0, *np.bincount(labels, minlength=clusters)])
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-        texels = len(labels)
-        self.step = max(1, _DECODED_BYTES // (12 * texels))
-        self.step = min(self.step, math.ceil(self.n_pairs / _GROUPS))
-        width = components + _OVERSAMPLING
-        fixed = (
-            _PROCESS_BYTES + 3 * 4 * width * texels
-        )  # frames, the sum, and one in double precision
-        fixed += (1 + components) * (
-            3 * self.n_pairs * clusters * self.dtypes[0].itemsize + texels * self.dtypes[1].itemsize
-        )
-        each = 4 * width * texels + 3 * 12 * self.step * texels
-        if fixed + each > memory:
-            raise InputError(
-                f"{clusters} clusters of {components} components and {texels} texels need"
-                f" {math.ceil((fixed + each) / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
-                " or ask for fewer clusters."
-            )
-        self.at_once = int(min((memory - fixed) // each, 2 * threads))
-        self.threads = min(threads, self.at_once)
 
     def _groups(self, work):
         """Apply `work` to the steps of each group of pairs; yields the results in order."""

@@ -132,10 +132,10 @@ def test_neither_step_of_the_clustering_raises_the_error(rng):
 def test_more_terms_and_more_clusters_are_better(patchy_sample):
     sample = patchy_sample(regions=8, rank=6, shape=(20, 20))
     by_terms = [
-        compress_local_pca(sample, clusters=4, components=n).about["rmse"] for n in (1, 2, 4, 8, 16)
+        compress_local_pca(sample, clusters=4, components=n).about["rmse"] for n in (1, 3, 9)
     ]
     by_clusters = [
-        compress_local_pca(sample, clusters=n, components=2).about["rmse"] for n in (1, 2, 8, 32)
+        compress_local_pca(sample, clusters=n, components=2).about["rmse"] for n in (1, 8, 32)
     ]
     for errors in (by_terms, by_clusters):
         assert all(later < earlier for earlier, later in itertools.pairwise(errors))
