@@ -1,0 +1,617 @@
+"""Local PCA over clusters of texels, of one material or a database (Müller et al. 2007, section 5.2).
+
+Texels whose values over all lights and views are alike form a cluster; each cluster has a mean and a few principal
+vectors of its own. Materials measured under the same directions share the clusters. The steps are the paper's: each
+sample is reduced by an SVD to 150 terms, the reduced texels of all samples are clustered together, and each cluster's
+PCA is then that of the original pictures, read in blocks.
+"""
+
+import itertools
+import math
+from types import SimpleNamespace
+
+import numpy as np
+
+from btfpipe.compression.local_clusters import local_clusters
+from btfpipe.compression.model import Model, measured_error
+from btfpipe.compression.svd import _PROCESS_BYTES, _require_range, compress_svd, planar_pictures
+from btfpipe.errors import InputError
+from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+
+# Of the pictures' 3 bytes a texel and pair, by default one in so many is spent: with 8 components in half precision
+# this gives 16 clusters to a sample of 128 x 128 texels and 81 x 81 directions, and 250 to fifteen with 151 x 151,
+# the numbers of the paper.
+DEFAULT_RATIO = 54
+_REDUCED_TERMS = 150
+_JOINT_TERMS = 512  # of several samples together
+_OVERSAMPLING = 6
+_TYPES = {  # of the bases and the coordinates
+    "half": (np.dtype(np.float16), np.dtype(np.float16)),
+    "single": (np.dtype(np.float32), np.dtype(np.float32)),
+    "byte": (np.dtype(np.int8), np.dtype(np.float16)),
+}
+_GROUPS = 32  # partial sums a pass, added in order; fixed, so that threads and memory never show
+_DECODED_BYTES = 6 << 20  # linear pictures in a thread's hands; fixed, as sums hang on it
+_NOISE = 1e-6  # a singular value below this share of its cluster's norm is rounding
+_DIRECTIONS = ("light_directions", "view_directions", "light_index", "view_index")
+_FACTS = ("toroidal", "texels_per_mm", "absolute")
+
+
+class LocalPcaModel(Model):
+    """One or several materials as clusters of texels, each with a mean and principal vectors over all pairs.
+
+    ``value[texel, pair] = basis[label[texel], pair, 0] + sum_k coordinate[texel, k] * basis[label[texel], pair, k]``
+
+    The Model evaluates one of its materials; `material` gives the others, which share its memory.
+
+    Parameters
+    ----------
+    bases : (clusters, pairs, 3, 1 + terms) float16, float32 or int8
+        The mean of the cluster, then its principal vectors.
+    coordinates : (texels of all materials, terms) float16 or float32
+        At most 1 in magnitude, so that the bases are of the size of the values.
+    labels : (texels of all materials,) unsigned int
+        Cluster of each texel, material by material, row by row.
+    materials : list of dict
+        ``name``, ``shape``, ``toroidal``, ``texels_per_mm``, ``absolute`` of each.
+    source : Appearance
+        Gives directions and index tables.
+    about : dict, optional
+        Facts for the file.
+    chosen : int
+        The material that is evaluated.
+    scales : (clusters, pairs) float16, optional
+        What bases in bytes are multiplied by.
+    """
+
+    method = "local-pca"
+
+    def __init__(
+        self, bases, coordinates, labels, materials, source, about=None, chosen=0, scales=None
+    ):
+        facts = {name: materials[chosen][name] for name in _FACTS}
+        tables = {name: getattr(source, name) for name in _DIRECTIONS}
+        super().__init__(materials[chosen]["shape"], SimpleNamespace(**facts, **tables), about)
+        self.bases = bases
+        self.scales = scales
+        self.coordinates = coordinates
+        self.labels = labels
+        self.about |= {"materials": materials, "material": chosen}
+
+    @property
+    def n_clusters(self):
+        return len(self.bases)
+
+    @property
+    def n_terms(self):
+        """Principal vectors a cluster, the mean left out."""
+        return self.coordinates.shape[1]
+
+    @property
+    def materials(self):
+        """Names of the materials."""
+        return tuple(fact["name"] for fact in self.about["materials"])
+
+    def material(self, which):
+        """The same database, evaluating another of its materials.
+
+        Parameters
+        ----------
+        which : int or str
+            Index or name.
+
+        Raises
+        ------
+        InputError
+            If there is no such material.
+        """
+        names = self.materials
+        index = names.index(which) if which in names else which
+        if not isinstance(index, int | np.integer) or not 0 <= index < len(names):
+            raise InputError(
+                f"no material {which!r}; the database holds {len(names)}: {', '.join(names)}."
+            )
+        return type(self)(
+            self.bases, self.coordinates, self.labels, self.about["materials"], self, self.about,
+            int(index), self.scales,
+        )  # fmt: skip
+
+    def arrays(self):
+        """Of the whole database, whichever material is evaluated; so is `nbytes`."""
+        arrays = {"bases": self.bases, "coordinates": self.coordinates, "labels": self.labels}
+        return arrays if self.scales is None else arrays | {"scales": self.scales}
+
+    @classmethod
+    def from_arrays(cls, reader, source):
+        about = reader.about
+        materials, chosen = about.get("materials"), about.get("material", 0)
+        wanted = {"name", "shape", *_FACTS}
+        if (
+            not isinstance(materials, list)
+            or not all(isinstance(fact, dict) and wanted <= set(fact) for fact in materials)
+            or not isinstance(chosen, int)
+            or not 0 <= chosen < len(materials)
+        ):
+            raise InputError(
+                f"{reader.path}: its description does not say which materials it holds."
+            )
+        texels = sum(math.prod(fact["shape"]) for fact in materials)
+        coordinates = reader.require("coordinates", (texels, None), "f")
+        shape = (None, len(source.light_index), 3, 1 + coordinates.shape[1])
+        bases = reader.require("bases", shape, "fi")
+        scales = reader.require("scales", bases.shape[:2], "f") if "scales" in reader else None
+        labels = reader.require("labels", (texels,), "u")
+        if texels and labels.max() >= len(bases):
+            raise InputError(
+                f"{reader.path}: labels reach {labels.max()}; expected less than {len(bases)} clusters."
+            )
+        return cls(bases, coordinates, labels, materials, source, about, chosen, scales)
+
+    def _range(self):
+        """Slice of the material's texels."""
+        counts = [math.prod(fact["shape"]) for fact in self.about["materials"]]
+        first = sum(counts[: self.about["material"]])
+        return slice(first, first + counts[self.about["material"]])
+
+    def own_texels(self):
+        """Coordinates (texels, terms) float32 and labels (texels,) int32 of the material."""
+        own = self._range()
+        return np.asarray(self.coordinates[own], np.float32), np.asarray(self.labels[own], np.int32)
+
+    def bases_of(self, index):
+        """Bases float32 of an index into clusters, or into clusters and pairs."""
+        bases = np.array(self.bases[index], np.float32, order="C")
+        if self.scales is not None:
+            bases *= np.asarray(self.scales[index], np.float32)[..., None, None]
+        return bases
+
+    def pictures(self, pairs):
+        from btfpipe.compression.local_shading import fill_pictures
+
+        coordinates, labels = self.own_texels()
+        bases = self.bases_of((slice(None), pairs))
+        out = np.empty((bases.shape[1], len(labels), 3), np.float32)
+        fill_pictures(coordinates, labels, bases, out)
+        return out.reshape(-1, *self.shape, 3)
+
+    def texels(self, rows, cols):
+        coordinates, labels = self.own_texels()
+        index = np.ravel_multi_index(
+            (np.asarray(rows) % self.shape[0], np.asarray(cols) % self.shape[1]), self.shape
+        )
+        coordinates, labels = coordinates[index], labels[index]
+        out = np.empty((len(index), self.n_pairs, 3), np.float32)
+        for cluster in np.unique(labels):
+            own = np.flatnonzero(labels == cluster)
+            basis = self.bases_of(cluster)
+            out[own] = np.tensordot(coordinates[own], basis[..., 1:], (1, 2)) + basis[..., 0]
+        return out
+
+    def shader(self, interpolation="barycentric"):
+        from btfpipe.compression.local_shading import LocalPcaShader
+
+        return LocalPcaShader(self, interpolation)
+
+
+def compress_local_pca(
+    samples,
+    *,
+    clusters=None,
+    components=8,
+    target_bytes=None,
+    precision="half",
+    names=None,
+    seed=0,
+    threads=1,
+    memory=2 << 30,
+    on_progress=None,
+):
+    """Cluster the texels of one or several Samples and give each cluster its own PCA.
+
+    Parameters
+    ----------
+    samples : Appearance or sequence of Appearances
+        Of the same directions and pairs; sizes may differ. Read in blocks of pictures, some six times.
+    clusters : int, optional
+        By default as many as `target_bytes` holds.
+    components : int
+        Principal vectors a cluster beside its mean, at least 1; no more are made than the largest cluster has.
+    target_bytes : int, optional
+        Size to stay within. A cluster takes ``3 * pairs * (1 + components)`` numbers (and a scale for each pair, in
+        bytes), a texel `components` numbers and its cluster. By default a 54th of the pictures at 3 bytes a texel
+        and pair: 16 clusters for one sample of 128 x 128 texels and 81 x 81 directions, in half precision.
+    precision : str
+        Of the numbers: ``half``, ``single``, or ``byte``: bases in bytes that are scaled for each cluster and pair,
+        coordinates in half precision.
+    names : sequence of str, optional
+        Of the materials; by default ``material 0`` and so on.
+    seed : int
+        Of the random starts.
+    threads : int
+        Never changes the result.
+    memory : int
+        Bytes of private memory to stay within; limits how many blocks are worked on at a time, never the result.
+    on_progress : callable, optional
+        Called with (pictures read, pictures to read).
+
+    Returns
+    -------
+    LocalPcaModel
+        Evaluates the first material. Its ``about`` holds `n_clusters`, `n_terms`, `precision`, `warnings` (sentences),
+        `materials` (with `rmse` and `relative_error` of each), and over all materials `rmse` and `relative_error`,
+        measured on the numbers as stored and over all linear values.
+
+    Raises
+    ------
+    InputError
+        Samples of different directions, more clusters than texels, a target too small for one cluster, no components,
+        non-finite pictures, values beyond half precision, or too little memory.
+    """
+    samples = [samples] if hasattr(samples, "n_pairs") else list(samples)
+    if not samples:
+        raise InputError("no samples given; expected at least one.")
+    names = [f"material {i}" for i in range(len(samples))] if names is None else list(names)
+    if len(set(names)) != len(samples):
+        raise InputError(
+            f"{len(samples)} samples have {len(set(names))} different names; expected one each."
+        )
+    if precision not in _TYPES:
+        raise InputError(f"precision {precision!r}; expected half, single or byte.")
+    if components < 1:
+        raise InputError(f"{components} components asked for; expected at least 1.")
+    _require_equal_directions(samples, names)
+    pairs = samples[0].n_pairs
+    clusters = _cluster_count(samples, clusters, components, target_bytes, precision)
+    plan = _plan(samples, clusters, components, precision, threads, memory)
+    progress = _Progress(on_progress, pairs * (6 * len(samples) + 1))
+
+    points = _reduced(samples, names, seed, threads, memory, progress)
+    labels, directions, _ = local_clusters(
+        points, clusters, components,
+        given=components + _OVERSAMPLING, seed=seed, threads=threads, on_progress=progress.part(pairs),
+    )  # fmt: skip
+    passes = _Passes(samples, labels, clusters, precision, plan, progress)
+    with single_threaded_blas():
+        frames = passes.frames(points, directions)
+        del points, directions
+        frames = passes.improve(frames, components)
+        bases, scales, coordinates = passes.project(frames, components)
+    most = max(frame.shape[1] for frame in frames) - 1
+    warnings = []
+    if most < components:
+        warnings.append(
+            f"the clusters have at most {most} terms beside their mean: {components - most} of the"
+            f" {components} components left out"
+        )
+        bases, coordinates = bases[..., : 1 + most].copy(), coordinates[:, :most].copy()
+    materials = [
+        {
+            "name": name,
+            "shape": [int(n) for n in sample.shape],
+            "toroidal": bool(sample.toroidal),
+            "texels_per_mm": sample.texels_per_mm,
+            "absolute": bool(getattr(sample, "absolute", False)),
+        }
+        for name, sample in zip(names, samples, strict=True)
+    ]
+    labels = labels.astype(np.min_scalar_type(clusters - 1))
+    model = LocalPcaModel(bases, coordinates, labels, materials, samples[0], scales=scales)
+    for index, (sample, facts) in enumerate(zip(samples, materials, strict=True)):
+        facts |= measured_error(
+            model.material(index), sample, threads=threads, on_progress=progress.part(pairs)
+        )
+    progress.finish()
+    model.about |= {
+        "n_clusters": clusters,
+        "n_terms": model.n_terms,
+        "precision": precision,
+        **_overall(materials),
+        "warnings": warnings,
+    }
+    return model
+
+
+def _overall(materials):
+    """RMSE and relative error over the values of all materials, from those of each."""
+    squared, energy, count = 0.0, 0.0, 0
+    for facts in materials:
+        texels = math.prod(facts["shape"])
+        squared += facts["rmse"] ** 2 * texels
+        if facts["relative_error"] > 0:
+            energy += (facts["rmse"] / facts["relative_error"]) ** 2 * texels
+        count += texels
+    return {
+        "rmse": math.sqrt(squared / count),
+        "relative_error": math.sqrt(squared / energy) if energy > 0 else 0.0,
+    }
+
+
+def _require_equal_directions(samples, names):
+    """Refuse samples of different directions, naming the sample and what differs."""
+    first = samples[0]
+    for sample, name in zip(samples[1:], names[1:], strict=True):
+        for table in _DIRECTIONS:
+            ours, theirs = getattr(first, table), getattr(sample, table)
+            if len(ours) != len(theirs):
+                what = f"{len(theirs)} {_PLURALS[table]}, {names[0]} has {len(ours)}"
+            elif table.endswith("index") and (ours != theirs).any():
+                what = f"the same directions as {names[0]}, but pairs them in another order"
+            elif not table.endswith("index") and np.abs(ours - theirs).max() > 1e-6:
+                at = int(np.abs(ours - theirs).max(axis=1).argmax())
+                angle = math.degrees(math.acos(np.clip(np.dot(ours[at], theirs[at]), -1, 1)))
+                what = f"other {_PLURALS[table]} than {names[0]}: number {at} differs by {angle:.3g} degrees"
+            else:
+                continue
+            raise InputError(
+                f"a database needs samples of equal directions; {name} has {what}."
+                " Compress them apart, or resample one to the other's directions."
+            )
+
+
+_PLURALS = {
+    "light_directions": "lights",
+    "view_directions": "views",
+    "light_index": "pairs",
+    "view_index": "pairs",
+}
+
+
+def _cluster_count(samples, clusters, components, target_bytes, precision):
+    """How many clusters, as asked for or as the bytes allow."""
+    pairs = samples[0].n_pairs
+    texels = sum(sample.shape[0] * sample.shape[1] for sample in samples)
+    if clusters is not None:
+        if target_bytes is not None:
+            raise InputError("clusters and target bytes are both given; expected one of them.")
+        if clusters < 1:
+            raise InputError(f"{clusters} clusters asked for; expected at least 1.")
+        if clusters > texels:
+            raise InputError(f"{clusters} clusters for {texels} texels; expected at most {texels}.")
+        return clusters
+    first = samples[0]
+    fixed = sum(getattr(first, table).nbytes for table in _DIRECTIONS[:2])
+    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
+    fixed += texels * (components * coordinate + 1)
+    each = pairs * (3 * (1 + components) * basis + (2 if precision == "byte" else 0))
+    # more clusters than this have texels to themselves
+    most = max(1, texels // (1 + components))
+    if target_bytes is None:
+        return min(max(1, (3 * pairs * texels // DEFAULT_RATIO - fixed) // each), most)
+    count = (target_bytes - fixed) // each
+    if count > 256:
+        count = (target_bytes - fixed - texels) // each  # two bytes for a texel's cluster
+    if count < 1:
+        raise InputError(
+            f"{target_bytes} bytes hold no cluster of {components} components; expected at least"
+            f" {fixed + each}. Raise the target, or ask for fewer components."
+        )
+    return int(min(count, most))
+
+
+def _plan(samples, clusters, components, precision, threads, memory):
+    """Pairs decoded at a time, groups of them at once, and threads, so that all stays within the memory.
+
+    Only the first has a part in the result, and it depends on the samples alone.
+    """
+    pairs, texels = samples[0].n_pairs, sum(math.prod(sample.shape) for sample in samples)
+    step = max(1, _DECODED_BYTES // (12 * texels))
+    step = min(step, math.ceil(pairs / _GROUPS))
+    width = components + _OVERSAMPLING
+    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
+    # frames, the sum, and one in double precision; the answer
+    fixed = _PROCESS_BYTES + 4 * 4 * width * texels
+    fixed += (1 + components) * (3 * pairs * clusters * basis + texels * coordinate)
+    each = 4 * width * texels + 3 * 12 * step * texels  # a partial sum; pictures being decoded
+    # before that: what the samples are reduced to, and points made of it
+    reduced = _PROCESS_BYTES + 4 * min(_REDUCED_TERMS, texels) * (
+        2 * texels + 3 * pairs * len(samples)
+    )
+    need = max(fixed + each, reduced)
+    if need > memory:
+        raise InputError(
+            f"{clusters} clusters of {components} components and {texels} texels need"
+            f" {math.ceil(need / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
+            " or ask for fewer clusters."
+        )
+    at_once = int(min((memory - fixed) // each, 2 * threads))
+    return step, at_once, min(threads, at_once)
+
+
+class _Progress:
+    """Reports stages of known weight, each with its own idea of a total, as one."""
+
+    def __init__(self, on_progress, total):
+        self.on_progress, self.total, self.before, self.last = on_progress, total, 0, 0
+
+    def part(self, weight):
+        """A callable for the next stage, which counts for `weight`."""
+        start, self.before = self.before, min(self.before + weight, self.total)
+        end = self.before
+
+        def report(done, total):
+            self._say(start + int((end - start) * min(done, total) / total))
+
+        return report if self.on_progress is not None else None
+
+    def finish(self):
+        if self.on_progress is not None:
+            self._say(self.total)
+
+    def _say(self, done):
+        self.last = max(self.last, done)
+        self.on_progress(self.last, self.total)
+
+
+def _reduced(samples, names, seed, threads, memory, progress):
+    """Points (texels of all samples, dimensions) float32 whose distances are nearly those of the texels.
+
+    Each sample is reduced to its first 150 singular vectors. Those of several samples are brought into one
+    orthonormal frame, the principal one of what the samples have kept: with the right factors side by side,
+    ``W = [V_1 S_1, V_2 S_2, ...]`` and ``W^T W = Z L Z^T``, sample m's coordinates in the frame ``W Z L^(-1/2)`` are
+    ``U_m Z_m L^(1/2)``.
+    """
+    textures, angular = [], []
+    for sample, name in zip(samples, names, strict=True):
+        try:
+            model = compress_svd(
+                sample, _REDUCED_TERMS, iterations=1, precision="single", seed=seed, threads=threads,
+                memory=memory, on_progress=progress.part(3 * sample.n_pairs),
+            )  # fmt: skip
+        except InputError as error:
+            raise InputError(f"{name}: {error}" if len(samples) > 1 else str(error)) from error
+        root = np.sqrt(np.array(model.about["singular_values"])).astype(np.float32)
+        textures.append((model.texture_factors.reshape(-1, model.n_terms), root))
+        angular.append((model.angular_factors.reshape(-1, model.n_terms), root))
+    if len(samples) == 1:
+        points = textures[0][0] * textures[0][1]
+    else:
+        ends = np.cumsum([0, *(len(root) for _, root in angular)])
+        gram = np.zeros((ends[-1], ends[-1]))
+        with single_threaded_blas():
+            for part in blocks(3 * samples[0].n_pairs, 4096):
+                some = np.concatenate([factors[part] * root for factors, root in angular], axis=1)
+                gram += some.T @ some
+            del angular
+            values, turn = np.linalg.eigh(gram)
+            kept = np.flatnonzero(values[::-1][:_JOINT_TERMS] > 1e-9 * max(values[-1], 1e-300))
+            values, turn = values[::-1][kept], turn[:, ::-1][:, kept]
+            turn = turn * np.sqrt(values)
+            parts = []
+            for m, (texture, root) in enumerate(textures):
+                inverse = np.where(root > 0, 1 / np.where(root > 0, root, 1), 0)
+                parts.append((texture * inverse) @ turn[ends[m] : ends[m + 1]].astype(np.float32))
+        points = np.concatenate(parts)
+    points -= points.mean(axis=0, dtype=np.float64).astype(np.float32)
+    return points
+
+
+class _Passes:
+    """Passes over the pictures of all samples, their texels sorted by cluster.
+
+    A cluster's matrix `A` has its texels for rows, pairs and channels for columns. Its *frame* is a few orthonormal
+    columns over the texels, the first of them constant: ``A^T frame`` gives the mean and, as the others are orthogonal
+    to the constant, centred sums.
+    """
+
+    def __init__(self, samples, labels, clusters, precision, plan, progress):
+        self.samples, self.progress = samples, progress
+        self.step, self.at_once, self.threads = plan
+        self.dtypes = _TYPES[precision]
+        self.n_pairs = samples[0].n_pairs
+        self.order = np.argsort(labels, kind="stable")
+        ends = np.cumsum([0, *np.bincount(labels, minlength=clusters)])
+        self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+    def _groups(self, work):
+        """Apply `work` to the steps of each group of pairs; yields the results in order."""
+        report = self.progress.part(self.n_pairs * len(self.samples))
+        groups = blocks(self.n_pairs, math.ceil(self.n_pairs / _GROUPS))
+
+        def run(group):
+            return work(
+                slice(start, min(start + self.step, group.stop))
+                for start in range(group.start, group.stop, self.step)
+            )
+
+        results = ordered_map(run, groups, self.threads, ahead=self.at_once)
+        for group, result in zip(groups, results, strict=True):
+            yield result
+            if report is not None:
+                report(group.stop, self.n_pairs)
+
+    def _values(self, pairs):
+        """Linear values (3 * pairs, texels) float32, texels sorted by cluster."""
+        values = [planar_pictures(sample, pairs) for sample in self.samples]
+        values = values[0] if len(values) == 1 else np.concatenate(values, axis=1)
+        return values[:, self.order]
+
+    def frames(self, points, directions):
+        """First frames, from the reduced texels and the principal directions of their clusters."""
+        return [
+            _frame(points[self.order[part]] @ basis)
+            for part, basis in zip(self.parts, directions, strict=True)
+        ]
+
+    def improve(self, frames, components):
+        """One power iteration on the original pictures.
+
+        Returns
+        -------
+        list of (texels, 1 + components or fewer) float32
+            Frames of the best directions in the span of each given frame, once more multiplied by ``A A^T``.
+        """
+        widths = [frame.shape[1] for frame in frames]
+        image = np.zeros((len(self.order), max(widths) - 1), np.float32)
+        grams = [np.zeros((width, width)) for width in widths]
+
+        def work(steps):
+            sums, squares = np.zeros_like(image), [np.zeros_like(gram) for gram in grams]
+            for pairs in steps:
+                values = self._values(pairs)
+                for part, frame, square in zip(self.parts, frames, squares, strict=True):
+                    own = values[:, part]
+                    weights = own @ frame
+                    square += weights.T @ weights
+                    sums[part, : frame.shape[1] - 1] += own.T @ weights[:, 1:]
+            return sums, squares
+
+        for sums, squares in self._groups(work):
+            image += sums
+            for gram, square in zip(grams, squares, strict=True):
+                gram += square
+        improved = []
+        for part, gram in zip(self.parts, grams, strict=True):
+            values, turn = np.linalg.eigh(gram[1:, 1:])
+            values, turn = values[::-1][:components], turn[:, ::-1][:, :components]
+            kept = values > _NOISE**2 * np.trace(gram)
+            improved.append(_frame(image[part, : len(gram) - 1] @ turn[:, kept]))
+        return improved
+
+    def project(self, frames, components):
+        """Bases, their scales (None unless in bytes), and coordinates in the order of the texels."""
+        bases = np.zeros((len(self.parts), self.n_pairs, 3, 1 + components), self.dtypes[0])
+        scales = None
+        if bases.dtype == np.int8:
+            scales = np.zeros(bases.shape[:2], np.float16)
+        coordinates = np.zeros((len(self.order), components), self.dtypes[1])
+        scaled = []
+        for part, frame in zip(self.parts, frames, strict=True):
+            # coordinates of largest magnitude 1; `A^T` of the constant column is the mean times the root of n
+            largest = np.abs(frame[:, 1:]).max(axis=0, initial=0)
+            coordinates[self.order[part], : len(largest)] = frame[:, 1:] / largest
+            scaled.append(frame * np.append(np.float32(1 / math.sqrt(len(frame))), largest))
+
+        def work(steps):
+            for pairs in steps:
+                values = self._values(pairs)
+                for cluster, (part, frame) in enumerate(zip(self.parts, scaled, strict=True)):
+                    found = (values[:, part] @ frame).reshape(-1, 3, frame.shape[1])
+                    if scales is None:
+                        _require_range(bases.dtype, found)
+                    else:
+                        found, scales[cluster, pairs] = _bytes(found)
+                    bases[cluster, pairs, :, : frame.shape[1]] = found
+
+        for _ in self._groups(work):
+            pass
+        return bases, scales, coordinates
+
+
+def _bytes(values):
+    """Values (pairs, 3, n) in whole steps, -127 to 127, and the size of each pair's step, float16."""
+    largest = np.abs(values).max(axis=(1, 2))
+    _require_range(np.float16, largest / 127)
+    steps = (largest / 127).astype(np.float16)
+    size = np.where(steps > 0, steps, np.inf).astype(np.float32)[:, None, None]
+    return np.clip(np.round(values / size), -127, 127), steps
+
+
+def _frame(columns):
+    """A constant column and an orthonormal basis of the columns made orthogonal to it, float32."""
+    n = len(columns)
+    columns = columns[:, : n - 1].astype(np.float64)
+    constant = np.full((n, 1), 1 / math.sqrt(n))
+    columns -= columns.mean(axis=0)
+    basis = np.linalg.qr(np.concatenate([constant, columns], axis=1))[0]
+    basis[:, 0] = constant[:, 0]
+    return basis.astype(np.float32)

@@ -1,0 +1,327 @@
+"""PCA of each view's pictures over the lights (Wang-PCA 2009, section 3, equations 1 and 2).
+
+With the view held, pictures change smoothly with the light: a mean picture and a few eigen-textures, weighted per
+light, stand for all of them. Each view is a problem of its own: a matrix of lights x (texels and channels), whose
+eigen-textures follow from its small Gram matrix of lights x lights.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from btfpipe.compression.model import Model, measured_error
+from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
+from btfpipe.errors import InputError
+from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.shading import PairWeights, corners
+
+_COLUMNS = (
+    8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
+)
+_TYPES = {  # of the mean and the eigen-textures
+    "half": (np.float16, np.float16),
+    "single": (np.float32, np.float32),
+    "byte": (np.float16, np.int8),
+}
+_NOISE = 1e-6  # a singular value below this share of the view's norm is rounding
+
+
+class ViewPcaModel(Model):
+    """A Sample as ``value[texel, view, light] = sum_k weight[view, light, k] * texture[view, k, texel]``.
+
+    Term 0 is the mean picture of the view, with the same weight under every light.
+
+    Parameters
+    ----------
+    means : (views, rows, cols, 3) float16 or float32
+        Scaled to a largest magnitude of 1, as are the textures: half precision then holds samples of any range.
+    textures : (views, components, rows, cols, 3) float16, float32, or int8 in steps of 1 / 127
+        Eigen-textures.
+    weights : (views, lights, 1 + components) float32
+        Of the mean and of the textures as they are stored, their scale inside.
+    source : Appearance
+        Gives directions, index tables, toroidal, texels_per_mm; a product.
+    """
+
+    method = "view-pca"
+
+    def __init__(self, means, textures, weights, source, about=None):
+        super().__init__(means.shape[1:3], source, about)
+        self.require_product("per-view PCA")
+        self.means = means
+        self.textures = textures
+        self.weights = weights
+
+    @property
+    def n_terms(self):
+        """Eigen-textures a view, the mean left out."""
+        return self.textures.shape[1]
+
+    def arrays(self):
+        return {"means": self.means, "textures": self.textures, "weights": self.weights}
+
+    @classmethod
+    def from_arrays(cls, reader, source):
+        views, lights = len(source.view_directions), len(source.light_directions)
+        means = reader.require("means", (views, None, None, 3), "f")
+        textures = reader.require("textures", (views, None, *means.shape[1:]), "fi")
+        weights = reader.require("weights", (views, lights, 1 + textures.shape[1]), "f")
+        return cls(means, textures, weights, source, reader.about)
+
+    def terms(self, view):
+        """Mean and eigen-textures (1 + components, texels, 3) float32 of a view, as the weights expect them."""
+        mean = np.asarray(self.means[view], np.float32)[None]
+        terms = np.concatenate([mean, np.asarray(self.textures[view], np.float32)])
+        return terms.reshape(len(terms), -1, 3)
+
+    def pictures(self, pairs):
+        views, lights = self.view_index[pairs], self.light_index[pairs]
+        out = np.empty((len(views), 3 * self.shape[0] * self.shape[1]), np.float32)
+        for view in np.unique(views):
+            chosen = np.flatnonzero(views == view)
+            terms = self.terms(view)
+            out[chosen] = self.weights[view][lights[chosen]] @ terms.reshape(len(terms), -1)
+        return out.reshape(-1, *self.shape, 3)
+
+    def texels(self, rows, cols):
+        means = np.asarray(self.means[:, rows, cols], np.float32)[:, None]
+        terms = np.asarray(self.textures[:, :, rows, cols], np.float32)
+        terms = np.concatenate([means, terms], axis=1)
+        values = np.asarray(self.weights) @ terms.reshape(*terms.shape[:2], -1)
+        return np.ascontiguousarray(values.reshape(self.n_pairs, -1, 3).swapaxes(0, 1))
+
+    def shader(self, interpolation="barycentric"):
+        return ViewPcaShader(self, interpolation)
+
+
+def compress_view_pca(
+    sample,
+    components=5,
+    *,
+    precision="half",
+    seed=0,
+    threads=1,
+    memory=2 << 30,
+    on_progress=None,
+):
+    """Make a mean picture and eigen-textures of each view, and their weights for each light.
+
+    Parameters
+    ----------
+    sample : Appearance
+        A product of views and lights; read view by view, twice.
+    components : int
+        Eigen-textures a view, at least 1. The lights of a view, less its mean, have at most lights - 1; terms
+        that are rounding noise in every view are left out too.
+    precision : str
+        Of the pictures: ``half``, ``single``, or ``byte``, which keeps the mean in half precision.
+    seed : int
+        Not needed: nothing is random. Taken as by other methods.
+    threads : int
+        Never changes the result.
+    memory : int
+        Bytes of private memory to stay within; limits the views worked on at a time, never the result.
+    on_progress : callable, optional
+        Called with (pictures read, pictures to read).
+
+    Returns
+    -------
+    ViewPcaModel
+        Its ``about`` holds `n_terms`, `precision`, `warnings` (sentences), and, measured on the textures as stored
+        and over all linear values, `rmse`, `relative_error` (RMS of the error over RMS of the values) and
+        `energy_error` (its square: the error's share of the energy). The paper quotes an error below 2.22 % for
+        five components without saying which.
+
+    Raises
+    ------
+    InputError
+        Not a product, no components, non-finite pictures, or too little memory.
+    """
+    if precision not in _TYPES:
+        raise InputError(f"precision {precision!r}; expected half, single or byte.")
+    if components < 1:
+        raise InputError(f"{components} components asked for; expected at least 1.")
+    sample.require_product("per-view PCA")
+    lights, views = len(sample.light_directions), len(sample.view_directions)
+    texels = sample.shape[0] * sample.shape[1]
+    kept = min(components, lights - 1, 3 * texels)
+    means = np.empty((views, *sample.shape, 3), _TYPES[precision][0])
+    textures = np.empty((views, kept, *sample.shape, 3), _TYPES[precision][1])
+    step = 127 if precision == "byte" else 1
+    size = means.nbytes + textures.nbytes
+    threads = _views_at_once(lights, views, texels, kept, size, threads, memory)
+    weights = np.empty((views, lights, 1 + kept), np.float32)
+
+    def work(view):
+        pairs = slice(view * lights, (view + 1) * lights)
+        values = planar_pictures(sample, pairs).reshape(lights, -1)
+        terms, weights[view], rank = _view_terms(values, kept)
+        terms = terms.reshape(-1, 3, *sample.shape).transpose(0, 2, 3, 1)
+        means[view] = terms[0]
+        textures[view] = np.round(terms[1:] * step) if step > 1 else terms[1:]
+        weights[view, :, 1:] /= step
+        return view, rank
+
+    most = 0
+    total = 2 * sample.n_pairs
+    with single_threaded_blas():
+        for view, rank in ordered_map(work, range(views), threads, ahead=threads):
+            most = max(most, rank)
+            if on_progress is not None:
+                on_progress((view + 1) * lights, total)
+    warnings = []
+    if most < components:
+        warnings.append(
+            f"the views have at most {most} terms beside their mean: {components - most} of the"
+            f" {components} components left out"
+        )
+        textures, weights = textures[:, :most].copy(), weights[:, :, : 1 + most].copy()
+    model = ViewPcaModel(means, textures, weights, sample)
+    error = measured_error(
+        model,
+        sample,
+        threads=threads,
+        on_progress=on_progress and (lambda done, _: on_progress(sample.n_pairs + done, total)),
+    )
+    model.about = {
+        "n_terms": model.n_terms,
+        "precision": precision,
+        **error,
+        "energy_error": error["relative_error"] ** 2,
+        "warnings": warnings,
+    }
+    return model
+
+
+def _views_at_once(lights, views, texels, terms, model_bytes, threads, memory):
+    """How many views fit the memory, at most `threads`."""
+    fixed = _PROCESS_BYTES + model_bytes
+    # the values and a copy on the way to them; the mean in double precision; the terms twice
+    each = 12 * texels * (2 * lights + 2 + 2 * (1 + terms)) + 16 * lights * _COLUMNS
+    if fixed + each > memory:
+        raise InputError(
+            f"a view of {lights} pictures of {texels} texels, and textures for {views} views, need"
+            f" {math.ceil((fixed + each) / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
+            " or ask for fewer components."
+        )
+    return int(min((memory - fixed) // each, threads))
+
+
+def _view_terms(values, terms):
+    """Mean and eigen-textures of one view.
+
+    The eigen-textures are the projections of the centred pictures on the first eigenvectors of their Gram matrix; the
+    eigenvectors are the weights, orthonormal to double precision, so that all of them give the pictures back
+    to rounding, whatever the eigenvalues.
+
+    Parameters
+    ----------
+    values : (lights, n) float32
+        Centred in place.
+    terms : int
+
+    Returns
+    -------
+    textures : (1 + terms, n) float32
+        Each of largest magnitude 1, or zero.
+    weights : (lights, 1 + terms) float32
+    rank : int
+        Terms above rounding, at most `terms`; those beyond are zero.
+    """
+    lights = len(values)
+    mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
+    energy = lights * float(np.vecdot(mean.astype(np.float64), mean))
+    if not math.isfinite(energy):
+        raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+    values -= mean
+    gram = np.zeros((lights, lights))
+    for part in blocks(values.shape[1], _COLUMNS):
+        columns = values[:, part].astype(np.float64)
+        gram += columns @ columns.T
+    energy += float(np.trace(gram))
+    eigenvalues, vectors = np.linalg.eigh(gram)
+    eigenvalues, vectors = eigenvalues[::-1][:terms], vectors[:, ::-1][:, :terms]
+    rank = int((eigenvalues > _NOISE**2 * energy).sum())
+    vectors = vectors.astype(np.float32)
+    vectors[:, rank:] = 0
+    textures = np.concatenate([mean[None], vectors.T @ values])
+    weights = np.concatenate([np.ones((lights, 1), np.float32), vectors], axis=1)
+    scale = np.abs(textures).max(axis=1)
+    textures /= np.where(scale > 0, scale, 1)[:, None]
+    return textures, weights * scale, rank
+
+
+class ViewPcaShader:
+    """Evaluates a `ViewPcaModel` between its texels, lights and views.
+
+    Weights are linear in the values: those of the lights around a direction are blended within each view, then the
+    view's textures are summed once, at four texels.
+
+    Parameters
+    ----------
+    model : ViewPcaModel
+    interpolation : str
+        ``barycentric``, ``four`` or ``nearest``.
+    """
+
+    def __init__(self, model, interpolation="barycentric"):
+        self.pairs = PairWeights(model, interpolation)
+        self.rows, self.cols = model.shape
+        self.toroidal = model.toroidal
+        views, terms = len(model.means), 1 + model.n_terms
+        # the terms of a texel and view lie together; single precision, as the processor computes in no other
+        self.textures = np.empty((self.rows * self.cols, views, 3 * terms), np.float32)
+        for view in range(views):
+            self.textures[:, view] = model.terms(view).swapaxes(0, 1).reshape(-1, 3 * terms)
+        self.weights = np.ascontiguousarray(model.weights, np.float32).reshape(-1, terms)
+        self.lights = model.weights.shape[1]
+
+    def shade(self, row, col, w_i, w_o, out):
+        """Fill `out`; see `Appearance.shader`."""
+        for part, pair, share in self.pairs.blocks(w_i, w_o):
+            _shade(
+                self.textures, self.weights, self.lights, self.rows, self.cols, self.toroidal,
+                row[part], col[part], pair, share, out[part],
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _shade(textures, weights, lights, rows, cols, toroidal, row, col, pair, share, out):
+    terms = weights.shape[1]
+    one = int(np.sqrt(pair.shape[1]))  # lights around a light, views around a view
+    texel = np.zeros(4, np.int64)
+    bilinear = np.zeros(4, np.float32)
+    blended = np.zeros(terms, np.float32)
+    for q in range(len(row)):
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
+        red = np.float32(0)
+        green = np.float32(0)
+        blue = np.float32(0)
+        for o in range(one):
+            first = o * one
+            blended[:] = 0.0
+            for i in range(first, first + one):
+                weight = weights[pair[q, i]]
+                w = share[q, i]
+                for k in range(terms):
+                    blended[k] += w * weight[k]
+            view = pair[q, first] // lights
+            t0 = textures[texel[0], view]
+            t1 = textures[texel[1], view]
+            t2 = textures[texel[2], view]
+            t3 = textures[texel[3], view]
+            for k in range(terms):
+                w = blended[k]
+                w0 = w * bilinear[0]
+                w1 = w * bilinear[1]
+                w2 = w * bilinear[2]
+                w3 = w * bilinear[3]
+                red += (w0 * t0[3 * k] + w1 * t1[3 * k]) + (w2 * t2[3 * k] + w3 * t3[3 * k])
+                at = 3 * k + 1
+                green += (w0 * t0[at] + w1 * t1[at]) + (w2 * t2[at] + w3 * t3[at])
+                at = 3 * k + 2
+                blue += (w0 * t0[at] + w1 * t1[at]) + (w2 * t2[at] + w3 * t3[at])
+        out[q, 0] = red
+        out[q, 1] = green
+        out[q, 2] = blue
