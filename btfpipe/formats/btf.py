@@ -294,15 +294,18 @@ def _read_directions(file, header):
     for v in range(n_views):
         *views[v], n_lights = file.unpack("ffI", section)
         file.need(8 * n_lights, f"{section}: lights of view {v}")
-        lights = np.frombuffer(file.take(8 * n_lights, section), "<f4").reshape(-1, 2)
+        lights = file.take(8 * n_lights, section)
         if first is None:
             first = lights
-        if n_lights < 1 or n_lights != len(first) or not np.array_equal(lights, first):
+        if not lights:
+            raise file.wrong(f"{section}: number of lights of view {v}", 0, "at least 1")
+        if lights != first:
             raise InputError(
-                f"{file.path}: {section}: the {n_lights} lights of view {v} differ from the {len(first)} of view"
-                " 0; expected the same lights for every view."
+                f"{file.path}: {section}: the {n_lights} lights of view {v} differ from the {len(first) // 8} of"
+                " view 0; expected the same lights for every view."
             )
-    for name, angles in (("view", views), ("light", first.astype(float))):
+    lights = np.frombuffer(first, "<f4").reshape(-1, 2).astype(float)
+    for name, angles in (("view", views), ("light", lights)):
         theta = angles[:, 0]
         good = np.isfinite(angles).all(axis=1) & (theta >= 0) & (theta <= math.pi / 2 + 1e-3)
         if not good.all():
@@ -313,9 +316,9 @@ def _read_directions(file, header):
             )
         theta = np.minimum(theta, math.pi / 2)
         setattr(header, f"{name}_directions", from_angles(theta, angles[:, 1]))
-    pair = np.arange(n_views * len(first))
-    header.light_index = (pair % len(first)).astype(np.int32)
-    header.view_index = (pair // len(first)).astype(np.int32)
+    pair = np.arange(n_views * len(lights))
+    header.light_index = (pair % len(lights)).astype(np.int32)
+    header.view_index = (pair // len(lights)).astype(np.int32)
 
 
 def _with_rotations(file, header, body):
