@@ -65,9 +65,13 @@ def _shade(
     texture, angular, ends, factor, space, matrix, mean, epsilon, log_range,
     rows, cols, toroidal, row, col, pair, share, out,
 ):  # fmt: skip
+    n = texture.shape[1]
+    most = pair.shape[1]
     texel = np.zeros(4, np.int64)
     bilinear = np.zeros(4, np.float32)
-    channel = np.zeros((3, 4), np.float32)
+    local = np.zeros((n, 4), np.float32)
+    channel = np.zeros((3, 3, 4), np.float32)  # channel, pair, texel
+    weight = np.zeros(3, np.float32)
     zero = np.float32(0)
     for q in range(len(row)):
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
@@ -75,34 +79,68 @@ def _shade(
         t1 = texture[texel[1]]
         t2 = texture[texel[2]]
         t3 = texture[texel[3]]
+        for k in range(n):
+            local[k, 0] = t0[k]
+            local[k, 1] = t1[k]
+            local[k, 2] = t2[k]
+            local[k, 3] = t3[k]
         red, green, blue = zero, zero, zero
-        for p in range(pair.shape[1]):
-            w = share[q, p]
-            if w == 0.0:
+        # three pairs at a time: four texels fill a vector, and three sums at once hide an addition's delay
+        for first in range(0, most, 3):
+            p1 = min(first + 1, most - 1)
+            p2 = min(first + 2, most - 1)
+            weight[0] = share[q, first] * factor[pair[q, first]]
+            weight[1] = share[q, p1] * factor[pair[q, p1]] if p1 == first + 1 else zero
+            weight[2] = share[q, p2] * factor[pair[q, p2]] if p2 == first + 2 else zero
+            if weight[0] == 0.0 and weight[1] == 0.0 and weight[2] == 0.0:
                 continue
-            w *= factor[pair[q, p]]
-            a = angular[pair[q, p]]
-            for c in range(3):  # the pair's factors are read once for the four texels
-                s0, s1, s2, s3 = zero, zero, zero, zero
-                for k in range(ends[c], ends[c + 1]):
-                    s0 += a[k] * t0[k]
-                    s1 += a[k] * t1[k]
-                    s2 += a[k] * t2[k]
-                    s3 += a[k] * t3[k]
-                channel[c, 0] = s0
-                channel[c, 1] = s1
-                channel[c, 2] = s2
-                channel[c, 3] = s3
-            for i in range(4):
-                if bilinear[i] == 0.0:
-                    continue
-                r, g, b = decode_colour(
-                    space, channel[0, i], channel[1, i], channel[2, i], matrix, mean, epsilon,
-                    log_range,
-                )  # fmt: skip
-                red += w * bilinear[i] * r
-                green += w * bilinear[i] * g
-                blue += w * bilinear[i] * b
+            a = angular[pair[q, first]]
+            b = angular[pair[q, p1]]
+            c = angular[pair[q, p2]]
+            for part in range(3):
+                a0, a1, a2, a3 = zero, zero, zero, zero
+                b0, b1, b2, b3 = zero, zero, zero, zero
+                c0, c1, c2, c3 = zero, zero, zero, zero
+                for k in range(ends[part], ends[part + 1]):
+                    x = a[k]
+                    y = b[k]
+                    z = c[k]
+                    a0 += x * local[k, 0]
+                    a1 += x * local[k, 1]
+                    a2 += x * local[k, 2]
+                    a3 += x * local[k, 3]
+                    b0 += y * local[k, 0]
+                    b1 += y * local[k, 1]
+                    b2 += y * local[k, 2]
+                    b3 += y * local[k, 3]
+                    c0 += z * local[k, 0]
+                    c1 += z * local[k, 1]
+                    c2 += z * local[k, 2]
+                    c3 += z * local[k, 3]
+                channel[part, 0, 0] = a0
+                channel[part, 0, 1] = a1
+                channel[part, 0, 2] = a2
+                channel[part, 0, 3] = a3
+                channel[part, 1, 0] = b0
+                channel[part, 1, 1] = b1
+                channel[part, 1, 2] = b2
+                channel[part, 1, 3] = b3
+                channel[part, 2, 0] = c0
+                channel[part, 2, 1] = c1
+                channel[part, 2, 2] = c2
+                channel[part, 2, 3] = c3
+            for p in range(3):
+                for i in range(4):
+                    w = weight[p] * bilinear[i]
+                    if w == 0.0:
+                        continue
+                    r, g, bl = decode_colour(
+                        space, channel[0, p, i], channel[1, p, i], channel[2, p, i], matrix, mean,
+                        epsilon, log_range,
+                    )  # fmt: skip
+                    red += w * r
+                    green += w * g
+                    blue += w * bl
         out[q, 0] = red
         out[q, 1] = green
         out[q, 2] = blue
