@@ -132,22 +132,65 @@ def compress_svd(
     InputError
         No terms, non-finite pictures, values beyond half precision, or too little memory.
     """
+    texture, angular, facts = factorise(
+        sample, n_terms, iterations=iterations, precision=precision, seed=seed, threads=threads,
+        memory=memory, on_progress=on_progress,
+    )  # fmt: skip
+    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+
+
+def factorise(
+    sample,
+    n_terms,
+    *,
+    rows=None,
+    channels=3,
+    measure=True,
+    iterations=None,
+    precision="half",
+    seed=0,
+    threads=1,
+    memory=2 << 30,
+    on_progress=None,
+):
+    """Factorise a matrix whose rows are made from the pictures of a Sample; see `compress_svd`.
+
+    Parameters
+    ----------
+    rows : callable, optional
+        ``rows(sample, pairs)`` gives the matrix's rows (pairs * channels, texels) float32; by default the
+        linear values, `planar_pictures`.
+    channels : int
+        Rows that each picture makes.
+    measure : bool
+        Read the pictures once more for the error of the stored factors.
+
+    Returns
+    -------
+    texture : (texels, n), angular : (pairs, channels, n)
+        Float16 or float32.
+    facts : dict
+        As `compress_svd` keeps them; ``rmse`` and ``relative_error`` only if measured.
+    """
     if precision not in ("half", "single"):
         raise InputError(f"precision {precision!r}; expected half or single.")
     texels = sample.shape[0] * sample.shape[1]
-    most = min(texels, 3 * sample.n_pairs)
     if n_terms < 1:
         raise InputError(f"{n_terms} terms asked for; expected at least 1.")
+<<<<<<< HEAD
     asked, n_terms = n_terms, min(n_terms, most)
+=======
+    n_terms, width, n_first = _sizes(sample, n_terms, channels)
+>>>>>>> btf
     import scipy.linalg  # noqa: F401 (before its BLAS is limited to one thread)
 
-    width = min(n_terms + _OVERSAMPLING, most)
-    most_passes = (_MOST_ITERATIONS if iterations is None else iterations) + 1
+    most_passes = _most_passes(iterations)
     rng = np.random.default_rng(seed)
-    first = min(sample.n_pairs, max(sample.n_pairs // _FIRST_SHARE, width))
-    first = np.sort(rng.choice(sample.n_pairs, first, replace=False))
-    total = _FIRST_PASSES * len(first) + (most_passes + 1) * sample.n_pairs
-    passes = _Passes(sample, width, threads, memory, total, on_progress)
+    first = np.sort(rng.choice(sample.n_pairs, n_first, replace=False))
+    total = pictures_to_read(sample, n_terms, channels, iterations, measure)
+    passes = _Passes(
+        sample, rows or planar_pictures, channels, width, threads, memory, total, on_progress
+    )
     with single_threaded_blas():
         basis = rng.standard_normal((texels, width), np.float32)
         for _ in range(_FIRST_PASSES):
@@ -170,10 +213,11 @@ def compress_svd(
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
         root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
-        texture = (basis @ (turn * root).astype(np.float32)).reshape(*sample.shape, n_terms)
-        angular = (flat @ turn / root).reshape(sample.n_pairs, 3, n_terms)
+        texture = basis @ (turn * root).astype(np.float32)
+        angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
+<<<<<<< HEAD
         model = SvdModel(texture.astype(dtype), angular.astype(dtype), sample)
         squared_error = passes.squared_error(model)
     model.about = {
@@ -194,8 +238,42 @@ def compress_svd(
         model.about.setdefault("warnings", []).append(
             f"the sample's rank is {n_terms}: {min(asked, most) - n_terms} terms left out"
         )
+=======
+        texture, angular = texture.astype(dtype), angular.astype(dtype)
+        facts = {
+            "n_terms": n_terms,
+            "iterations": iteration,
+            "excess": excess,
+            "precision": precision,
+        }
+        if measure:
+            squared = passes.squared_error(texture, angular)
+            facts |= {
+                "rmse": math.sqrt(squared / (channels * texels * sample.n_pairs)),
+                "relative_error": math.sqrt(squared / energy) if energy > 0 else 0.0,
+            }
+    facts["singular_values"] = [float(f"{value:.6g}") for value in singular]
+>>>>>>> btf
     passes.finish()
-    return model
+    return texture, angular, facts
+
+
+def pictures_to_read(sample, n_terms, channels=3, iterations=None, measure=True):
+    """The most pictures that `factorise` reads, as its progress counts them."""
+    n_first = _sizes(sample, n_terms, channels)[2]
+    return _FIRST_PASSES * n_first + (_most_passes(iterations) + measure) * sample.n_pairs
+
+
+def _most_passes(iterations):
+    return (_MOST_ITERATIONS if iterations is None else iterations) + 1
+
+
+def _sizes(sample, n_terms, channels):
+    """Terms that can exist, columns of the subspace, and pictures for the start."""
+    most = min(sample.shape[0] * sample.shape[1], channels * sample.n_pairs)
+    n_terms = min(n_terms, most)
+    width = min(n_terms + _OVERSAMPLING, most)
+    return n_terms, width, min(sample.n_pairs, max(sample.n_pairs // _FIRST_SHARE, width))
 
 
 def _orthonormal(columns):
@@ -247,8 +325,9 @@ def _require_range(dtype, *factors):
 class _Passes:
     """Passes over a Sample's pictures: groups of fixed size on threads, results summed in their order."""
 
-    def __init__(self, sample, width, threads, memory, total, on_progress):
-        self.sample, self.total, self.on_progress = sample, total, on_progress
+    def __init__(self, sample, rows, channels, width, threads, memory, total, on_progress):
+        self.sample, self.rows, self.channels = sample, rows, channels
+        self.total, self.on_progress = total, on_progress
         self.texels = sample.shape[0] * sample.shape[1]
         # pictures decoded at a time
         self.step = max(1, _DECODED_BYTES // (12 * self.texels))
@@ -257,7 +336,7 @@ class _Passes:
         # basis, its successor and QR's copies; the weights, and in double precision
         vectors = 4 * width * self.texels  # one array of as many columns as the subspace
         # the weights, also in double precision and turned; then what QR takes, or a pass
-        fixed = _PROCESS_BYTES + 4 * width * 18 * sample.n_pairs
+        fixed = _PROCESS_BYTES + 4 * width * 6 * channels * sample.n_pairs
         each = (
             2 * vectors + 36 * self.step * self.texels
         )  # two partial sums; pictures being decoded
@@ -294,40 +373,40 @@ class _Passes:
             self.on_progress(self.total, self.total)
 
     def power(self, basis, chosen=None):
-        """``A^T Q`` (pairs, 3, width), ``A A^T Q`` (texels, width) and the squared norm of the matrix.
+        """``A^T Q`` (pairs, channels, width), ``A A^T Q`` (texels, width) and the squared norm of the matrix.
 
         `chosen` restricts the matrix to some pairs.
         """
         count = self.sample.n_pairs if chosen is None else len(chosen)
-        weights = np.empty((count, 3, basis.shape[1]), np.float32)
+        weights = np.empty((count, self.channels, basis.shape[1]), np.float32)
         image = np.zeros(basis.shape, np.float32)
         energy = 0.0
 
         def work(steps):
             parts, sum_, share, squares = [], np.zeros_like(image), np.empty_like(image), 0.0
             for pairs in steps:
-                values = planar_pictures(self.sample, pairs)
+                values = self.rows(self.sample, pairs)
                 parts.append(values @ basis)
                 sum_ += np.matmul(values.T, parts[-1], out=share)
                 squares += _squares(values)
             return np.concatenate(parts), sum_, squares
 
         for group, (part, sum_, squares) in self._groups(work, chosen):
-            weights[group] = part.reshape(-1, 3, basis.shape[1])
+            weights[group] = part.reshape(-1, self.channels, basis.shape[1])
             image += sum_
             energy += squares
         return weights, image, energy
 
-    def squared_error(self, model):
-        """Sum of squared differences between the Sample and the Model's stored factors."""
-        texture = np.asarray(model.texture_factors, np.float32).reshape(-1, model.n_terms).T.copy()
+    def squared_error(self, texture, angular):
+        """Sum of squared differences between the matrix and the product of its stored factors."""
+        texture = np.asarray(texture, np.float32).T.copy()
 
         def work(steps):
             total = 0.0
             for pairs in steps:
-                values = planar_pictures(self.sample, pairs)
-                angular = np.asarray(model.angular_factors[pairs], np.float32)
-                values -= angular.reshape(-1, model.n_terms) @ texture
+                values = self.rows(self.sample, pairs)
+                weights = np.asarray(angular[pairs], np.float32)
+                values -= weights.reshape(-1, len(texture)) @ texture
                 total += _squares(values)
             return total
 
