@@ -2,10 +2,11 @@
 
 import click
 
-from btfpipe.cli.options import input_file, naming, progress, stage
+from btfpipe.cli.options import Memory, input_file, naming, progress, stage
 
 # As in btfpipe.compression.METHODS, which is not imported for --help.
-_METHODS = ("svd",)
+_METHODS = ("svd", "view-pca", "local-pca", "harmonics", "factored")
+_SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 
 
 @click.command()
@@ -15,12 +16,46 @@ _METHODS = ("svd",)
     type=click.Choice(_METHODS),
     default="svd",
     show_default=True,
-    help="svd: full-matrix singular value decomposition (Zhou et al. 2005).",
+    help="svd: full-matrix singular value decomposition (Zhou et al. 2005). view-pca: principal pictures of each view (Wang et"
+    " al. 2009). local-pca: clusters of texels with a PCA each (Müller et al. 2007); several samples make a database. harmonics:"
+    " spherical harmonics over views and lights (Leung et al. 2007). factored: channel by channel, as in Bonn's .btf files.",
 )
 @click.option(
     "--components",
     type=click.IntRange(min=1),
-    help="Terms of the sum. [default: svd 40]",
+    help="Terms of the sum: of svd, of each view, of each cluster.  [default: svd 40, view-pca 5, local-pca 8]",
+)
+@click.option(
+    "--space",
+    type=click.Choice(_SPACES),
+    help="Factorise luminance and chroma for themselves, of values or of their logarithm (svd, factored).",
+)
+@click.option(
+    "--channel-components",
+    type=click.IntRange(min=1),
+    nargs=3,
+    metavar="Y U V",
+    help="Terms of luminance and of each chroma (svd, factored).  [default: 32 16 16]",
+)
+@click.option(
+    "--clusters",
+    type=click.IntRange(min=1),
+    help="Of texels, for local-pca.  [default: as many as --target-bytes holds]",
+)
+@click.option(
+    "--target-bytes",
+    type=Memory(),
+    help="Size of the file, for local-pca, such as 800K.",
+)
+@click.option(
+    "--view-harmonics",
+    type=click.IntRange(min=1),
+    help="Harmonics over the views: a square number.  [default: 25]",
+)
+@click.option(
+    "--light-harmonics",
+    type=click.IntRange(min=1),
+    help="Harmonics over the lights: a square number.  [default: 25]",
 )
 @click.option(
     "--precision",
@@ -48,7 +83,11 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
     from btfpipe.metrics import raw_bytes
     from btfpipe.sample import Sample
 
+    if options["space"] is not None:
+        options["space"] = _SPACES[options["space"]]
     takes = METHODS[method].options
+    if method == "svd":
+        takes = takes | {"space": None, "channel_components": None}
     for name, value in options.items():
         if value is not None and name not in takes:
             raise click.UsageError(

@@ -19,6 +19,40 @@ METHODS = {
         "compress_svd",
         {"components": "n_terms", "precision": "precision", "iterations": "iterations"},
     ),
+    "factored": Method(
+        "btfpipe.compression.factored",
+        "FactoredModel",
+        "compress_factored",
+        {
+            "space": "space",
+            "channel_components": "terms",
+            "precision": "precision",
+            "iterations": "iterations",
+        },
+    ),
+    "view-pca": Method(
+        "btfpipe.compression.view_pca",
+        "ViewPcaModel",
+        "compress_view_pca",
+        {"components": "components", "precision": "precision"},
+    ),
+    "local-pca": Method(
+        "btfpipe.compression.local_pca",
+        "LocalPcaModel",
+        "compress_local_pca",
+        {
+            "components": "components",
+            "clusters": "clusters",
+            "target_bytes": "target_bytes",
+            "precision": "precision",
+        },
+    ),
+    "harmonics": Method(
+        "btfpipe.compression.harmonics",
+        "HarmonicsModel",
+        "compress_harmonics",
+        {"view_harmonics": "view_terms", "light_harmonics": "light_terms"},
+    ),
     "relighting": Method("btfpipe.compression.relighting", "RelightingModel", None, {}),
 }
 DATABASES = ("local-pca",)  # methods that take several samples at once
@@ -59,6 +93,8 @@ def compress(samples, method, *, seed=0, threads=1, memory=2 << 30, on_progress=
     InputError
         If the method refuses the samples.
     """
+    if method == "svd" and (options.get("space") or options.get("channel_components")):
+        method = "factored"  # channel by channel, in a colour space
     chosen = METHODS[method]
     function = getattr(importlib.import_module(chosen.module), chosen.function)
     if method not in DATABASES:

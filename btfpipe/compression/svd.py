@@ -136,7 +136,23 @@ def compress_svd(
         sample, n_terms, iterations=iterations, precision=precision, seed=seed, threads=threads,
         memory=memory, on_progress=on_progress,
     )  # fmt: skip
+    texels, most = sample.shape[0] * sample.shape[1], _most_terms(sample)
+    if n_terms > most:
+        facts.setdefault("warnings", []).append(
+            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
+            f" {n_terms - most} terms left out"
+        )
+    have = facts["n_terms"]
+    if have < min(n_terms, most):
+        facts.setdefault("warnings", []).append(
+            f"the sample's rank is {have}: {min(n_terms, most) - have} terms left out"
+        )
     return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+
+
+def _most_terms(sample, channels=3):
+    """As many terms as a matrix of the pictures can have."""
+    return min(sample.shape[0] * sample.shape[1], channels * sample.n_pairs)
 
 
 def factorise(
@@ -177,11 +193,7 @@ def factorise(
     texels = sample.shape[0] * sample.shape[1]
     if n_terms < 1:
         raise InputError(f"{n_terms} terms asked for; expected at least 1.")
-<<<<<<< HEAD
-    asked, n_terms = n_terms, min(n_terms, most)
-=======
     n_terms, width, n_first = _sizes(sample, n_terms, channels)
->>>>>>> btf
     import scipy.linalg  # noqa: F401 (before its BLAS is limited to one thread)
 
     most_passes = _most_passes(iterations)
@@ -217,28 +229,6 @@ def factorise(
         angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
-<<<<<<< HEAD
-        model = SvdModel(texture.astype(dtype), angular.astype(dtype), sample)
-        squared_error = passes.squared_error(model)
-    model.about = {
-        "n_terms": n_terms,
-        "iterations": iteration,
-        "excess": excess,
-        "precision": precision,
-        "rmse": math.sqrt(squared_error / (3 * texels * sample.n_pairs)),
-        "relative_error": math.sqrt(squared_error / energy) if energy > 0 else 0.0,
-        "singular_values": [float(f"{value:.6g}") for value in singular],
-    }
-    if asked > most:
-        model.about["warnings"] = [
-            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
-            f" {asked - most} terms left out"
-        ]
-    if n_terms < min(asked, most):
-        model.about.setdefault("warnings", []).append(
-            f"the sample's rank is {n_terms}: {min(asked, most) - n_terms} terms left out"
-        )
-=======
         texture, angular = texture.astype(dtype), angular.astype(dtype)
         facts = {
             "n_terms": n_terms,
@@ -253,7 +243,6 @@ def factorise(
                 "relative_error": math.sqrt(squared / energy) if energy > 0 else 0.0,
             }
     facts["singular_values"] = [float(f"{value:.6g}") for value in singular]
->>>>>>> btf
     passes.finish()
     return texture, angular, facts
 
@@ -270,7 +259,7 @@ def _most_passes(iterations):
 
 def _sizes(sample, n_terms, channels):
     """Terms that can exist, columns of the subspace, and pictures for the start."""
-    most = min(sample.shape[0] * sample.shape[1], channels * sample.n_pairs)
+    most = _most_terms(sample, channels)
     n_terms = min(n_terms, most)
     width = min(n_terms + _OVERSAMPLING, most)
     return n_terms, width, min(sample.n_pairs, max(sample.n_pairs // _FIRST_SHARE, width))

@@ -1,17 +1,20 @@
 """Which format a source has: told by looking, in one table that `ingest` and `info` share."""
 
+import contextlib
 import importlib
 from collections import namedtuple
 from pathlib import Path
 
 from btfpipe.formats.archive import is_zip
+from btfpipe.sample.measurement import Measurement
 
 # A format that can be read. `module` holds recognise(path), which gives a reason in words or None, and `opener`: a context manager that
-# yields a Measurement, or gives a Model. `options`: the opener's arguments that a user may set.
+# yields a Measurement, or a function that gives one, or a Model. `options`: the opener's arguments that a user may set.
 Format = namedtuple("Format", "module opener options")
 
 # In the order of asking: the particular before the general.
 FORMATS = {
+    "btf": Format("btfpipe.formats.btf", "read_btf", ()),
     "ptm": Format("btfpipe.formats.ptm", "read_model", ("transfer",)),
     "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
     "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),
@@ -45,4 +48,5 @@ def open_source(path, name, **options):
     context manager of a Measurement, or Model
     """
     format_ = FORMATS[name]
-    return getattr(importlib.import_module(format_.module), format_.opener)(path, **options)
+    opened = getattr(importlib.import_module(format_.module), format_.opener)(path, **options)
+    return contextlib.nullcontext(opened) if isinstance(opened, Measurement) else opened

@@ -12,6 +12,7 @@ WRITERS = {
     "utia": Writer("btfpipe.formats.utia", "write_utia", ("suffix",)),
     "curet": Writer("btfpipe.formats.curet_writing", "write_curet", ("suffix", "sample_number")),
     "rti": Writer("btfpipe.formats.rti", "write_lp", ("suffix",)),
+    "btf": Writer("btfpipe.formats.btf", "write_btf", ()),
     "pairs": Writer("btfpipe.formats.pairs", "write_pairs", ("suffix",)),
 }
 
@@ -26,4 +27,7 @@ def write(path, name, appearance, *, threads=1, on_progress=None, **options):
     """
     writer = WRITERS[name]
     function = getattr(importlib.import_module(writer.module), writer.function)
-    return function(path, appearance, threads=threads, on_progress=on_progress, **options)
+    facts = function(path, appearance, threads=threads, on_progress=on_progress, **options)
+    if isinstance(facts, dict):
+        return facts
+    return {"method": facts.method, "terms": list(facts.n_terms)}  # the Model that a .btf holds

@@ -204,7 +204,7 @@ def test_rgb_with_equal_terms_is_near_the_joint_factorisation(make_sample):
     assert apart <= joint * 1.01
 
 
-def test_a_list_of_pairs_is_compressed_but_not_shaded(make_sample):
+def test_a_list_of_pairs_is_compressed_and_shaded(make_sample):
     whole = make_sample()
     some = np.array([5, 99, 7, 60, 61, 62, 130])
     sample = Sample(
@@ -213,8 +213,11 @@ def test_a_list_of_pairs_is_compressed_but_not_shaded(make_sample):
     )  # fmt: skip
     model = compress_factored(sample, (7, 7, 7), precision="single")
     np.testing.assert_allclose(everything(model), everything(sample), rtol=1e-3, atol=3e-5)
-    with pytest.raises(InputError, match="shading needs every view under every light"):
-        model.shader()
+    for pair in range(7):
+        w_i = sample.light_directions[sample.light_index[pair]]
+        w_o = sample.view_directions[sample.view_index[pair]]
+        value = model.evaluate(2, 3, w_i, w_o)
+        np.testing.assert_allclose(value[0], sample.pictures([pair])[0, 2, 3], rtol=2e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -350,7 +350,7 @@ def test_bytes_take_less_and_cost_little_more_than_their_rounding(patchy_sample,
     )
 
 
-def test_a_list_of_pairs_is_compressed_but_not_shaded(patchy_sample):
+def test_a_list_of_pairs_is_compressed_and_shaded(patchy_sample):
     whole = patchy_sample()
     some = np.array([5, 39, 7, 20, 21, 22, 30])
     sample = Sample(
@@ -359,8 +359,11 @@ def test_a_list_of_pairs_is_compressed_but_not_shaded(patchy_sample):
     )  # fmt: skip
     model = compress_local_pca(sample, clusters=3, components=21, precision="single")
     np.testing.assert_allclose(matrix(model), matrix(sample), atol=1e-5)
-    with pytest.raises(InputError, match="shading needs every view under every light"):
-        model.shader()
+    for pair in range(7):
+        w_i = sample.light_directions[sample.light_index[pair]]
+        w_o = sample.view_directions[sample.view_index[pair]]
+        value = model.evaluate(2, 3, w_i, w_o)
+        np.testing.assert_allclose(value[0], sample.pictures([pair])[0, 2, 3], rtol=2e-3, atol=1e-4)
 
 
 def test_databases_of_different_directions_are_refused_by_name(patchy_sample):
