@@ -102,7 +102,7 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
     if cosine not in (None, "inside", "divided"):
         raise InputError(f"cosine {cosine!r}; expected inside or divided.")
     file = _File(path)
-    head = file.head(16)
+    head = file.bytes[:16].tobytes()
     signature = _signature(head)
     if signature is None:
         raise InputError(
@@ -122,21 +122,17 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
 
 
 class _File:
-    """A file read from front to back; every size is checked against what is left of it."""
+    """A mapped file, read from front to back; every size is checked against what is left of it."""
 
     def __init__(self, path):
         self.path = Path(path)
         try:
             self.size = self.path.stat().st_size
-            with self.path.open("rb") as file:
-                file.read(1)
+            # one mapping for all arrays: there may be more chunks than a process may have mappings
+            self.bytes = np.memmap(self.path, np.uint8, "r") if self.size else np.zeros(0, np.uint8)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
         self.at = 0
-
-    def head(self, count):
-        with self.path.open("rb") as file:
-            return file.read(count)
 
     def need(self, count, section):
         """Refuse if fewer than `count` bytes are left."""
@@ -149,9 +145,7 @@ class _File:
     def take(self, count, section):
         """The next bytes."""
         self.need(count, section)
-        with self.path.open("rb") as file:
-            file.seek(self.at)
-            data = file.read(count)
+        data = self.bytes[self.at : self.at + count].tobytes()
         self.at += count
         return data
 
@@ -170,9 +164,7 @@ class _File:
         """Map the next array, read-only."""
         count = math.prod(int(n) for n in shape)
         self.need(count * dtype.itemsize, section)
-        if count == 0:
-            return np.zeros(shape, dtype)
-        array = np.memmap(self.path, dtype, "r", self.at, tuple(shape))
+        array = np.ndarray(tuple(shape), dtype, self.bytes, self.at)
         self.at += array.nbytes
         return array
 
@@ -338,6 +330,8 @@ def _with_rotations(file, header, body):
             file.at += 4 * each * count
             return body(file, header)
         except InputError as error:
+            if file.at == file.size:  # the sizes fit, so something else is wrong
+                raise
             first = first or error
     raise first
 
