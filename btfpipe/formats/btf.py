@@ -187,6 +187,7 @@ class _Header:
     toroidal, texels_per_mm, absolute = False, None, False
 
     def __init__(self, kind, signature):
+        self.kind = kind
         self.facts = {"format": f"Bonn .btf, {kind}", "signature": signature.decode()}
         self.flag = None
         self.rows = self.cols = 0
@@ -315,9 +316,8 @@ def _read_directions(file, header):
 
 def _with_rotations(file, header, body):
     """Read the body behind the rotations, whose numbers some writers take for 9 and some for 3 a frame."""
-    if header.facts["format"].endswith("BDI"):
-        header.mask_at = file.at  # a BDI has its mask before the rotations
-        file.at = _bdi_rotations(file, header)
+    if header.kind == "BDI":
+        _read_mask(file, header)
     (count,) = file.unpack("I", "rotations") if header.rotations else (0,)
     if count == 0:
         return body(file, header)
@@ -501,15 +501,14 @@ def _read_pvf(file, header):
     return _measurement(file, header, read)
 
 
-def _bdi_rotations(file, header):
-    """Read what precedes a BDI's rotations; gives their place."""
+def _read_mask(file, header):
+    """What a BDI has before the rotations: how it is packed, and the mask of its texels."""
     header.scan_lines = file.count("scan lines a chunk")
     (header.packing,) = file.unpack("B", "compression")
     if header.packing not in (0, 2):
         found = "1 (bzip)" if header.packing == 1 else header.packing
         raise file.wrong("compression", found, "0 (all texels) or 2 (sparse)")
     header.mask = file.array((header.rows * header.cols,), np.dtype("u1"), "mask")
-    return file.at
 
 
 def _read_bdi(file, header, memory):
