@@ -102,7 +102,7 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
     if cosine not in (None, "inside", "divided"):
         raise InputError(f"cosine {cosine!r}; expected inside or divided.")
     file = _File(path)
-    head = file.head(16)
+    head = file.bytes[:16].tobytes()
     signature = _signature(head)
     if signature is None:
         raise InputError(
@@ -122,21 +122,17 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
 
 
 class _File:
-    """A file read from front to back; every size is checked against what is left of it."""
+    """A mapped file, read from front to back; every size is checked against what is left of it."""
 
     def __init__(self, path):
         self.path = Path(path)
         try:
             self.size = self.path.stat().st_size
-            with self.path.open("rb") as file:
-                file.read(1)
+            # one mapping for all arrays: there may be more chunks than a process may have mappings
+            self.bytes = np.memmap(self.path, np.uint8, "r") if self.size else np.zeros(0, np.uint8)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
         self.at = 0
-
-    def head(self, count):
-        with self.path.open("rb") as file:
-            return file.read(count)
 
     def need(self, count, section):
         """Refuse if fewer than `count` bytes are left."""
@@ -149,9 +145,7 @@ class _File:
     def take(self, count, section):
         """The next bytes."""
         self.need(count, section)
-        with self.path.open("rb") as file:
-            file.seek(self.at)
-            data = file.read(count)
+        data = self.bytes[self.at : self.at + count].tobytes()
         self.at += count
         return data
 
@@ -170,9 +164,7 @@ class _File:
         """Map the next array, read-only."""
         count = math.prod(int(n) for n in shape)
         self.need(count * dtype.itemsize, section)
-        if count == 0:
-            return np.zeros(shape, dtype)
-        array = np.memmap(self.path, dtype, "r", self.at, tuple(shape))
+        array = np.ndarray(tuple(shape), dtype, self.bytes, self.at)
         self.at += array.nbytes
         return array
 
@@ -195,6 +187,7 @@ class _Header:
     toroidal, texels_per_mm, absolute = False, None, False
 
     def __init__(self, kind, signature):
+        self.kind = kind
         self.facts = {"format": f"Bonn .btf, {kind}", "signature": signature.decode()}
         self.flag = None
         self.rows = self.cols = 0
@@ -323,9 +316,8 @@ def _read_directions(file, header):
 
 def _with_rotations(file, header, body):
     """Read the body behind the rotations, whose numbers some writers take for 9 and some for 3 a frame."""
-    if header.facts["format"].endswith("BDI"):
-        header.mask_at = file.at  # a BDI has its mask before the rotations
-        file.at = _bdi_rotations(file, header)
+    if header.kind == "BDI":
+        _read_mask(file, header)
     (count,) = file.unpack("I", "rotations") if header.rotations else (0,)
     if count == 0:
         return body(file, header)
@@ -338,6 +330,8 @@ def _with_rotations(file, header, body):
             file.at += 4 * each * count
             return body(file, header)
         except InputError as error:
+            if file.at == file.size:  # the sizes fit, so something else is wrong
+                raise
             first = first or error
     raise first
 
@@ -507,15 +501,14 @@ def _read_pvf(file, header):
     return _measurement(file, header, read)
 
 
-def _bdi_rotations(file, header):
-    """Read what precedes a BDI's rotations; gives their place."""
+def _read_mask(file, header):
+    """What a BDI has before the rotations: how it is packed, and the mask of its texels."""
     header.scan_lines = file.count("scan lines a chunk")
     (header.packing,) = file.unpack("B", "compression")
     if header.packing not in (0, 2):
         found = "1 (bzip)" if header.packing == 1 else header.packing
         raise file.wrong("compression", found, "0 (all texels) or 2 (sparse)")
     header.mask = file.array((header.rows * header.cols,), np.dtype("u1"), "mask")
-    return file.at
 
 
 def _read_bdi(file, header, memory):

@@ -516,6 +516,14 @@ def test_bdi_is_turned_into_pictures_within_its_memory(put, rng, packing, memory
     assert measurement.facts.get("missing_texels", 0) == (packing == 2) * (~mask).sum()
 
 
+def test_bdi_may_have_more_chunks_than_a_process_may_have_mappings(put, rng):
+    values = rng.random((70000, 1, 3)).astype(np.float16)
+    data = joined([("", b"!BDIF06R2!"), *meta(), *directions(VIEWS[:1], LIGHTS[:1])])
+    data += u32(1, 70000, 1) + bytes(1) + bytes(70000) + u32(0)
+    data += b"".join(u32(6) + texel.tobytes() for texel in values)
+    np.testing.assert_array_equal(read_btf(put(data)).read(0), values)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_bdi_goes_through_ingest(put, rng, tmp_path, threads):
     values = (rng.random((ROWS, COLS, len(VIEWS), len(LIGHTS), 3)) * 9).astype(np.float16)
@@ -686,7 +694,8 @@ def test_bad_bodies_are_refused_by_name(put, rng):
         for which in (0, 1):
             spoilt = [tuple(array.copy() for array in pair) for pair in channels]
             spoilt[1][which][2, 1] = bad
-            refuses(put(dfmf(spoilt)), "channel 1 holds 1 NaN or infinite values")
+            for kwargs in ({}, {"rotations": 2, "each": 3}, {"rotations": 2, "each": 9}):
+                refuses(put(dfmf(spoilt, **kwargs)), "channel 1 holds 1 NaN or infinite values")
     refuses(put(dfmf(channels, 3, (math.nan, 0, 0))), "colours holds 1 NaN")
     data = bytearray(joined(dfmf(channels)))
     data[len(joined(dfmf(channels)[:6]))] = 3
