@@ -9,7 +9,7 @@ SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: all setup sample gallery data-sample test test-slow bench lint fix clean
+.PHONY: all setup sample gallery formats data-sample test test-slow bench lint fix clean
 
 all: lint test
 
@@ -30,6 +30,11 @@ sample: $(READY)
 # The same materials, larger surfaces and pictures.
 gallery: $(READY)
 	$(SNAKEMAKE) --configfile config/gallery.yaml
+
+# A simulated material written in every format, read back, and laid side by side.
+formats: $(READY)
+	$(SNAKEMAKE) --configfile config/formats.yaml
+	@echo "Side by side: results/formats/formats/weave.png  Errors: results/formats/formats/weave.md"
 
 # Remake the simulated materials and the meshes in data-sample/.
 data-sample: $(READY)

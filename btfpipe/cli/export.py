@@ -26,8 +26,15 @@ _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
     type=click.IntRange(1, 61),
     help="Of a CUReT set: names its files, and decides on the lamp.  [default: 1]",
 )
+@click.option(
+    "--channel-components",
+    type=click.IntRange(min=1),
+    nargs=3,
+    metavar="Y U V",
+    help="Terms of luminance and of each chroma of a .btf; a Model of method factored keeps its own.  [default: 32 16 16]",
+)
 @stage(folder=True)
-def export(source, format_, suffix, sample_number, out, threads, quiet):
+def export(source, format_, suffix, sample_number, channel_components, out, threads, quiet):
     """Write SOURCE, a Sample or a Model, in a format that other programs read.
 
     Sets of pictures become a zip if the name ends in .zip, else a folder: ubo (Bonn's layout), utia, pairs (any pairs, with a CSV
@@ -43,7 +50,11 @@ def export(source, format_, suffix, sample_number, out, threads, quiet):
     from btfpipe.formats import targets
 
     format_ = format_ or ("btf" if out.suffix.lower() == ".btf" else "ubo")
-    options = {"suffix": suffix, "sample_number": sample_number}
+    options = {
+        "suffix": suffix,
+        "sample_number": sample_number,
+        "channel_components": channel_components,
+    }
     options = {name: value for name, value in options.items() if value is not None}
     for name in options:
         if name not in targets.WRITERS[format_].options:

@@ -26,7 +26,6 @@ def check_names():
                     f" {', '.join(config[f'{key}s'])}."
                 )
 
-
     for name in EXPORTS:
         if name not in config["samples"]:
             raise WorkflowError(

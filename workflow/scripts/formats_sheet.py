@@ -11,6 +11,7 @@ from btfpipe.metrics.pictures import to_display
 from btfpipe.metrics.sheet import below, beside, titled, to_bytes
 from btfpipe.rendering.preview import sample_sheet_pairs
 from btfpipe.sample import Sample
+from btfpipe.sample.resize import Resizer
 
 _PAIRS = 5
 _SIDE = 160  # pixels of a picture, about
@@ -77,11 +78,14 @@ def formats_sheet(original, appearances, sheet, table):
             f"| {name} | {back.shape[0]} x {back.shape[1]} | {back.n_pairs} | {error[0]} | {error[1]} |"
         )
         blocks.append(titled(below(rows, gap=2), f"{name}: read back, and the sample below"))
-    write_picture(sheet, below(blocks))
+    write_picture(sheet, below([beside(blocks[i : i + 2]) for i in range(0, len(blocks), 2)]))
     Path(table).write_text("\n".join(lines) + "\n")
 
 
 def _shown(picture, white):
+    """Display codes, enlarged by whole texels or resized to about one size."""
+    if max(picture.shape[:2]) > _SIDE:
+        picture = Resizer(picture.shape[:2], (_SIDE, _SIDE), False)(picture)
     zoom = max(1, round(_SIDE / max(picture.shape[:2])))
     return to_bytes(to_display(picture, white)).repeat(zoom, 0).repeat(zoom, 1)
 
