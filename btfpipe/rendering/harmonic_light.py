@@ -23,13 +23,28 @@ from btfpipe.directions.spherical_harmonics import (
     hemisphere_products,
     highest_degree,
     rotation_blocks,
+    spherical_harmonics,
 )
 from btfpipe.errors import InputError
+from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.shading import corners
 
+_PIXELS = 1 << 14  # of a map, projected at a time
 _GROUP = 16  # points worked on side by side: a register's width
 # turns n into t, so that a turn about t is one about n between two turns by this
 _ASIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def project_environment(environment, terms):
+    """Coefficients (terms, 3) of an `Environment`'s radiance, in the scene's axes."""
+    highest_degree(terms)
+    directions, solid_angles, radiances = environment.pixels()
+    out = np.zeros((terms, 3))
+    with single_threaded_blas():
+        for part in blocks(len(directions), _PIXELS):
+            basis = spherical_harmonics(directions[part], terms)
+            out += basis.T @ (solid_angles[part, None] * radiances[part])
+    return out
 
 
 class HarmonicEnvironment:
@@ -70,6 +85,7 @@ class HarmonicEnvironment:
             raise InputError(
                 f"{terms} terms of an environment asked for; it has {len(coefficients)}. Project it to more."
             )
+        self.occlusion_rays = 0  # a point, for a renderer to ask
         self.shader = HarmonicsShader(model)
         self.environment = np.ascontiguousarray(coefficients[:terms], np.float32)
         self.coupling = _coupling(model.light_terms, terms)

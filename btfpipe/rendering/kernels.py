@@ -203,6 +203,32 @@ def light_rays(
 
 
 @njit(cache=True, nogil=True)
+def cosine_rays(start, normal, chosen, items, rays, seed, origin, toward):
+    """Rays spread by the cosine about the normals of some points, `rays` each: fills origin and toward (m, 3) float32.
+
+    `items` (n,) int64 number the points for the random numbers; the rays of one are stratified by azimuth.
+    """
+    for q in range(len(chosen)):
+        h = chosen[q]
+        nx, ny, nz = normal[h, 0], normal[h, 1], normal[h, 2]
+        # Duff et al. 2017: a frame about the normal without a branch
+        sign = 1.0 if nz >= 0.0 else -1.0
+        a = -1.0 / (sign + nz)
+        b = nx * ny * a
+        for k in range(rays):
+            square = uniform(seed, items[q], 2 * k)
+            azimuth = 2.0 * np.pi * (k + uniform(seed, items[q], 2 * k + 1)) / rays
+            radius = np.sqrt(square)
+            x, y, z = radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1.0 - square)
+            ray = q * rays + k
+            toward[ray, 0] = x * (1.0 + sign * nx * nx * a) + y * b + z * nx
+            toward[ray, 1] = x * sign * b + y * (sign + ny * ny * a) + z * ny
+            toward[ray, 2] = -x * sign * nx - y * ny + z * nz
+            for c in range(3):
+                origin[ray, c] = start[h, c]
+
+
+@njit(cache=True, nogil=True)
 def count_lookups(lit, face, weight, coherent):
     """How many texel coordinates `gather_lookups` will fill for the points `lit` of one object."""
     count = 0

@@ -1,6 +1,6 @@
 """Objects of a scene: triangles, frames, and either an albedo or a dressing of texel coordinates."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -27,6 +27,10 @@ class Dressing:
         See `Appearance.shader`.
     rows, cols : int
     toroidal : bool
+    model : Appearance
+        What the shader evaluates.
+    skies : dict
+        `HarmonicEnvironment` by the number of the environment, which then lights this surface instead of its directional lights.
     """
 
     row: np.ndarray
@@ -38,6 +42,8 @@ class Dressing:
     rows: int
     cols: int
     toroidal: bool
+    model: object = None
+    skies: dict = field(default_factory=dict)
 
 
 @dataclass
@@ -140,7 +146,7 @@ def dress(vertices, faces, normals, tangents, coordinates, appearance, interpola
         )  # fmt: skip
     return Dressing(
         row, col, weight, axis, coherent, appearance.shader(interpolation), rows, cols,
-        bool(appearance.toroidal),
+        bool(appearance.toroidal), appearance,
     )  # fmt: skip
 
 

@@ -82,10 +82,18 @@ class Renderer:
         found = self.tree.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
         hits = np.flatnonzero(found["primID"] >= 0)
         points = Points(self, hits, found["primID"], origins, directions)
+        # of the whole film, so that what is drawn at random does not hang on tiles
+        pixel, sample = np.divmod(hits, film.samples)
+        points.pixels = (
+            (y + pixel // width) * film.width + x + pixel % width
+        ) * film.samples + sample
         radiance = np.zeros((len(hits), 3))
         if len(hits):
             for light in self.scene.lights:
                 self._add_light(light, points, radiance)
+            for number, thing in enumerate(self.scene.objects):
+                if thing.dressing is not None and thing.dressing.skies:
+                    self._add_skies(thing, np.flatnonzero(points.thing == number), points, radiance)
         picture = np.empty((width * height, len(LAYERS)))
         # depth along the camera's axis, as compositing programs expect it
         depth = points.depth * (directions[hits] @ camera.axes[2])
@@ -128,22 +136,58 @@ class Renderer:
             mine = lit[owner == number]
             if thing.dressing is None:
                 kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
-            elif len(mine):
-                self._add_dressed(thing, mine, points, w_i, irradiance, radiance)
+            elif len(mine) and light.environment not in thing.dressing.skies:
+                lookups = self._look_up(thing, mine, points, w_i)
+                row, col, at_i, at_o, blend, target = lookups
+                values = np.empty_like(at_i)
+                thing.dressing.shader.shade(row, col, at_i, at_o, values)
+                kernels.add_lookups(values, blend, target, irradiance, radiance)
 
-    def _add_dressed(self, thing, lit, points, w_i, irradiance, radiance):
+    def _add_skies(self, thing, mine, points, radiance):
+        """Add the light of environments that one object takes in the frequency domain."""
+        if not len(mine):
+            return
+        n = len(points.hits)
+        # the rows s, t, n of a look-up's frame are the scene's axes seen in it
+        frames = []
+        for axis in np.eye(3):
+            along = np.ascontiguousarray(np.broadcast_to(axis, (n, 3)))
+            row, col, at_i, at_o, blend, target = self._look_up(thing, mine, points, along)
+            frames.append(at_i)
+        frames = np.ascontiguousarray(np.stack(frames, axis=2))
+        values, full = np.empty_like(at_o), np.full((n, 3), np.pi)
+        for sky in thing.dressing.skies.values():
+            visibility = np.ones(n, np.float32)
+            if sky.occlusion_rays:
+                visibility[mine] = self._open_share(points, mine, sky.occlusion_rays)
+            sky.shade(row, col, frames, at_o, values, visibility[target])
+            np.maximum(values, 0, out=values)  # sharp lights ring
+            kernels.add_lookups(values, blend, target, full, radiance)
+
+    def _open_share(self, points, mine, rays):
+        """Share (n,) float32 of rays spread by the cosine about the normals of some points that meet nothing."""
+        origin, toward = (np.empty((len(mine) * rays, 3), np.float32) for _ in range(2))
+        pixels = points.pixels[mine]
+        kernels.cosine_rays(
+            points.start, points.normal, mine, pixels, rays, self.seed, origin, toward
+        )
+        far = np.full(len(origin), 1e30, np.float32)
+        blocked = self.tree.run(origin, toward, dists=far, query="OCCLUDED") >= 0
+        return 1 - blocked.reshape(-1, rays).mean(axis=1, dtype=np.float32)
+
+    def _look_up(self, thing, lit, points, w_i):
+        """Coordinates, light and view in the sample's frame, share and point of the look-ups that points of an object need."""
         dress = thing.dressing
         n = kernels.count_lookups(lit, points.face, dress.weight, dress.coherent)
         row, col, blend = (np.empty(n, np.float32) for _ in range(3))
-        at_i, at_o, values = (np.empty((n, 3), np.float32) for _ in range(3))
+        at_i, at_o = (np.empty((n, 3), np.float32) for _ in range(2))
         target = np.empty(n, np.int64)
         n = kernels.gather_lookups(
             lit, points.face, points.share, points.normal, points.facing, points.toward_eye, w_i,
             thing.faces, dress.row, dress.col, dress.weight, dress.axis, dress.coherent,
             dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target,
         )  # fmt: skip
-        dress.shader.shade(row[:n], col[:n], at_i[:n], at_o[:n], values[:n])
-        kernels.add_lookups(values[:n], blend, target, irradiance, radiance)
+        return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target))
 
 
 class Points:

@@ -31,12 +31,13 @@ class Light:
     """A directional or a point light.
 
     `place` is the unit vector towards it, or its position; `power` the irradiance of a surface that faces it, or its
-    intensity in W/sr.
+    intensity in W/sr; `environment` the number of the environment map that it stands for, with others.
     """
 
     directional: bool
     place: np.ndarray
     power: np.ndarray
+    environment: int | None = None
 
 
 @dataclass
@@ -115,13 +116,16 @@ def load_scene(
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
     try:
-        lights, environments, opened, things, grounds, files = [], [], {}, [], [], []
+        lights, environments, skies = [], [], {}
+        opened, things, grounds, files = {}, [], [], []
         for number, light in enumerate(description["lights"]):
             if light["type"] == "environment":
                 files.append(light["map"])
                 try:
                     environment = _environment(light, read_picture)
-                    lights += _stand_for(environment, light, seed)
+                    lights += _stand_for(environment, len(environments), light, seed)
+                    if light.get("method") == "harmonics":
+                        skies[number] = len(environments), environment, light
                 except InputError as error:
                     raise InputError(f"lights[{number}]: {error}") from error
                 environments.append(environment)
@@ -143,6 +147,11 @@ def load_scene(
                 things.append(objects.transformed(thing, entry.get("transform")))
             except InputError as error:
                 raise InputError(f"objects[{number}]: {error}") from error
+        for number, sky in skies.items():
+            try:
+                _add_sky(things, *sky)
+            except InputError as error:
+                raise InputError(f"lights[{number}]: {error}") from error
         dressed = [t for t in things if t.dressing is not None] or things
         if not dressed:
             raise InputError("objects: a ground needs something to lie below; add an object.")
@@ -189,12 +198,32 @@ def _environment(light, read_picture):
     )
 
 
-def _stand_for(environment, light, seed):
+def _stand_for(environment, number, light, seed):
     """The directional lights of an environment."""
+    method = light.get("method", "q2tree")
     directions, irradiances = environment.lights(
-        light.get("lights", 64), light.get("method", "q2tree"), seed
+        light.get("lights", 64), "q2tree" if method == "harmonics" else method, seed
     )
-    return [Light(True, *both) for both in zip(directions, irradiances, strict=True)]
+    return [Light(True, *both, number) for both in zip(directions, irradiances, strict=True)]
+
+
+def _add_sky(things, number, environment, light):
+    """Light the objects whose Model is made of harmonics by an environment's own."""
+    from btfpipe.compression.harmonics import HarmonicsModel
+    from btfpipe.rendering.harmonic_light import HarmonicEnvironment, project_environment
+
+    dressings = [t.dressing for t in things if t.dressing is not None]
+    dressings = [d for d in dressings if isinstance(d.model, HarmonicsModel)]
+    if not dressings:
+        raise InputError(
+            "method harmonics needs an object with a Model of that method (`btfpipe compress --method harmonics`);"
+            " there is none. Take method q2tree."
+        )
+    coefficients = project_environment(environment, light.get("terms", 169))
+    for dressing in dressings:
+        sky = HarmonicEnvironment(dressing.model, coefficients)
+        sky.occlusion_rays = light.get("occlusion_rays", 16)
+        dressing.skies[number] = sky
 
 
 def _require_room(path, opened, room):
