@@ -1,0 +1,87 @@
+"""Environments in the frequency domain, in scenes: against the same map as directional lights, and in closed form."""
+
+import numpy as np
+import pytest
+
+from btfpipe.compression.harmonics import compress_harmonics
+from btfpipe.directions import bonn81
+from btfpipe.errors import InputError
+from btfpipe.formats.images import colours, open_picture, write_picture
+from btfpipe.rendering.renderer import render
+from btfpipe.rendering.scene import load_scene
+from btfpipe.sample import Sample
+
+
+@pytest.fixture
+def white(tmp_path):
+    """File of a white diffuser, as harmonics."""
+    directions = bonn81()
+    pair = np.arange(81 * 81)
+    codes = directions[pair % 81, 2][:, None, None, None] * np.ones((1, 2, 2, 3))
+    sample = Sample(codes.astype(np.float32), directions, directions, pair % 81, pair // 81)
+    compress_harmonics(sample).save(tmp_path / "white.npz")
+    return tmp_path / "white.npz"
+
+
+def write_map(path, function, rows=32):
+    """A latitude-longitude map, y up, the picture's middle towards -z."""
+    v, u = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / rows, indexing="ij"
+    )
+    theta, phi = np.pi * (u - 1), np.pi * v
+    towards = np.stack(
+        [np.sin(phi) * np.sin(theta), np.cos(phi), -np.sin(phi) * np.cos(theta)], axis=-1
+    )
+    write_picture(path, function(towards).astype(np.float32))
+
+
+def picture(folder, method, extra="", more="", film=(8, 8)):
+    """Render a plane that faces +z, two units a side, of the white diffuser."""
+    path = folder / "scene.yaml"
+    path.write_text(
+        "camera: {type: orthographic, position: [0, 0, 3], target: [0, 0, 0], height: 1.8}\n"
+        f"lights: [{{type: environment, map: map.exr, visible: false, lights: 3000, method: {method}{extra}}}]\n"
+        "objects:\n"
+        "- {plane: {center: [0, 0, 0], s: [0.8, 0.6, 0], t: [-0.6, 0.8, 0], size: [3, 3]}, model: white.npz}\n"
+        + more
+    )
+    scene = load_scene(
+        path,
+        film={"width": film[1], "height": film[0], "samples": 1},
+        read_picture=lambda name: colours(open_picture(name), name),
+    )
+    return render(scene)[..., :3]
+
+
+def test_a_white_sky_makes_a_white_diffuser_white(white):
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    np.testing.assert_allclose(picture(white.parent, "harmonics"), 1, atol=0.01)
+
+
+def test_the_frequency_domain_agrees_with_many_lights(white):
+    def sky(d):
+        lamp = np.maximum(d @ [0.48, 0.36, 0.8], 0) ** 12
+        floor = np.maximum(-d[..., 1], 0)
+        return 0.2 + lamp[..., None] * [6, 3, 1] + floor[..., None] * [0, 0.2, 1]
+
+    write_map(white.parent / "map.exr", sky)
+    spectral, sampled = (picture(white.parent, method) for method in ("harmonics", "q2tree"))
+    assert np.ptp(sampled[4, 4]) > 0.2  # of different colours
+    np.testing.assert_allclose(spectral, sampled, rtol=0.02)
+
+
+def test_a_wall_hides_its_share_of_the_sky(white):
+    """A wall that stands on the plane takes half of the sky from a point at its foot."""
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    wall = "- {plane: {center: [0.02, 0, 50], s: [0, 1, 0], t: [0, 0, 1], size: [100, 100]}, albedo: [0, 0, 0]}\n"
+    hidden = picture(white.parent, "harmonics", ", occlusion_rays: 256", wall, (1, 9))[0, 4]
+    np.testing.assert_allclose(hidden, 0.5, atol=0.06)
+    whole = picture(white.parent, "harmonics", ", occlusion_rays: 0", wall, (1, 9))[0, 4]
+    np.testing.assert_allclose(whole, 1, atol=0.01)
+
+
+def test_a_scene_without_a_model_of_harmonics_is_told_so(white, make_sample):
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    make_sample(toroidal=True).save(white)
+    with pytest.raises(InputError, match=r"lights\[0\]: method harmonics needs an object"):
+        picture(white.parent, "harmonics")
