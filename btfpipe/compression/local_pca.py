@@ -6,33 +6,23 @@ sample is reduced by an SVD to 150 terms, the reduced texels of all samples are 
 PCA is then that of the original pictures, read in blocks.
 """
 
-import itertools
 import math
 from types import SimpleNamespace
 
 import numpy as np
 
 from btfpipe.compression.local_clusters import local_clusters
+from btfpipe.compression.local_passes import OVERSAMPLING, REDUCED_TERMS, TYPES, Passes, plan
 from btfpipe.compression.model import Model, measured_error
-from btfpipe.compression.svd import _PROCESS_BYTES, _require_range, compress_svd, planar_pictures
+from btfpipe.compression.svd import compress_svd
 from btfpipe.errors import InputError
-from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.parallel import blocks, single_threaded_blas
 
 # Of the pictures' 3 bytes a texel and pair, by default one in so many is spent: with 8 components in half precision
 # this gives 16 clusters to a sample of 128 x 128 texels and 81 x 81 directions, and 250 to fifteen with 151 x 151,
 # the numbers of the paper.
 DEFAULT_RATIO = 54
-_REDUCED_TERMS = 150
 _JOINT_TERMS = 512  # of several samples together
-_OVERSAMPLING = 6
-_TYPES = {  # of the bases and the coordinates
-    "half": (np.dtype(np.float16), np.dtype(np.float16)),
-    "single": (np.dtype(np.float32), np.dtype(np.float32)),
-    "byte": (np.dtype(np.int8), np.dtype(np.float16)),
-}
-_GROUPS = 32  # partial sums a pass, added in order; fixed, so that threads and memory never show
-_DECODED_BYTES = 6 << 20  # linear pictures in a thread's hands; fixed, as sums hang on it
-_NOISE = 1e-6  # a singular value below this share of its cluster's norm is rounding
 _DIRECTIONS = ("light_directions", "view_directions", "light_index", "view_index")
 _FACTS = ("toroidal", "texels_per_mm", "absolute")
 
@@ -255,22 +245,22 @@ def compress_local_pca(
         raise InputError(
             f"{len(samples)} samples have {len(set(names))} different names; expected one each."
         )
-    if precision not in _TYPES:
+    if precision not in TYPES:
         raise InputError(f"precision {precision!r}; expected half, single or byte.")
     if components < 1:
         raise InputError(f"{components} components asked for; expected at least 1.")
     _require_equal_directions(samples, names)
     pairs = samples[0].n_pairs
     clusters = _cluster_count(samples, clusters, components, target_bytes, precision)
-    plan = _plan(samples, clusters, components, precision, threads, memory)
+    planned = plan(samples, clusters, components, precision, threads, memory)
     progress = _Progress(on_progress, pairs * (6 * len(samples) + 1))
 
     points = _reduced(samples, names, seed, threads, memory, progress)
     labels, directions, _ = local_clusters(
         points, clusters, components,
-        given=components + _OVERSAMPLING, seed=seed, threads=threads, on_progress=progress.part(pairs),
+        given=components + OVERSAMPLING, seed=seed, threads=threads, on_progress=progress.part(pairs),
     )  # fmt: skip
-    passes = _Passes(samples, labels, clusters, precision, plan, progress)
+    passes = Passes(samples, labels, clusters, precision, planned, progress)
     with single_threaded_blas():
         frames = passes.frames(points, directions)
         del points, directions
@@ -370,7 +360,7 @@ def _cluster_count(samples, clusters, components, target_bytes, precision):
         return clusters
     first = samples[0]
     fixed = sum(getattr(first, table).nbytes for table in _DIRECTIONS[:2])
-    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
+    basis, coordinate = (dtype.itemsize for dtype in TYPES[precision])
     fixed += texels * (components * coordinate + 1)
     each = pairs * (3 * (1 + components) * basis + (2 if precision == "byte" else 0))
     # more clusters than this have texels to themselves
@@ -386,35 +376,6 @@ def _cluster_count(samples, clusters, components, target_bytes, precision):
             f" {fixed + each}. Raise the target, or ask for fewer components."
         )
     return int(min(count, most))
-
-
-def _plan(samples, clusters, components, precision, threads, memory):
-    """Pairs decoded at a time, groups of them at once, and threads, so that all stays within the memory.
-
-    Only the first has a part in the result, and it depends on the samples alone.
-    """
-    pairs, texels = samples[0].n_pairs, sum(math.prod(sample.shape) for sample in samples)
-    step = max(1, _DECODED_BYTES // (12 * texels))
-    step = min(step, math.ceil(pairs / _GROUPS))
-    width = components + _OVERSAMPLING
-    basis, coordinate = (dtype.itemsize for dtype in _TYPES[precision])
-    # frames, the sum, and one in double precision; the answer
-    fixed = _PROCESS_BYTES + 4 * 4 * width * texels
-    fixed += (1 + components) * (3 * pairs * clusters * basis + texels * coordinate)
-    each = 4 * width * texels + 3 * 12 * step * texels  # a partial sum; pictures being decoded
-    # before that: what the samples are reduced to, and points made of it
-    reduced = _PROCESS_BYTES + 4 * min(_REDUCED_TERMS, texels) * (
-        2 * texels + 3 * pairs * len(samples)
-    )
-    need = max(fixed + each, reduced)
-    if need > memory:
-        raise InputError(
-            f"{clusters} clusters of {components} components and {texels} texels need"
-            f" {math.ceil(need / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
-            " or ask for fewer clusters."
-        )
-    at_once = int(min((memory - fixed) // each, 2 * threads))
-    return step, at_once, min(threads, at_once)
 
 
 class _Progress:
@@ -454,7 +415,7 @@ def _reduced(samples, names, seed, threads, memory, progress):
     for sample, name in zip(samples, names, strict=True):
         try:
             model = compress_svd(
-                sample, _REDUCED_TERMS, iterations=1, precision="single", seed=seed, threads=threads,
+                sample, REDUCED_TERMS, iterations=1, precision="single", seed=seed, threads=threads,
                 memory=memory, on_progress=progress.part(3 * sample.n_pairs),
             )  # fmt: skip
         except InputError as error:
@@ -483,135 +444,3 @@ def _reduced(samples, names, seed, threads, memory, progress):
         points = np.concatenate(parts)
     points -= points.mean(axis=0, dtype=np.float64).astype(np.float32)
     return points
-
-
-class _Passes:
-    """Passes over the pictures of all samples, their texels sorted by cluster.
-
-    A cluster's matrix `A` has its texels for rows, pairs and channels for columns. Its *frame* is a few orthonormal
-    columns over the texels, the first of them constant: ``A^T frame`` gives the mean and, as the others are orthogonal
-    to the constant, centred sums.
-    """
-
-    def __init__(self, samples, labels, clusters, precision, plan, progress):
-        self.samples, self.progress = samples, progress
-        self.step, self.at_once, self.threads = plan
-        self.dtypes = _TYPES[precision]
-        self.n_pairs = samples[0].n_pairs
-        self.order = np.argsort(labels, kind="stable")
-        ends = np.cumsum([0, *np.bincount(labels, minlength=clusters)])
-        self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-
-    def _groups(self, work):
-        """Apply `work` to the steps of each group of pairs; yields the results in order."""
-        report = self.progress.part(self.n_pairs * len(self.samples))
-        groups = blocks(self.n_pairs, math.ceil(self.n_pairs / _GROUPS))
-
-        def run(group):
-            return work(
-                slice(start, min(start + self.step, group.stop))
-                for start in range(group.start, group.stop, self.step)
-            )
-
-        results = ordered_map(run, groups, self.threads, ahead=self.at_once)
-        for group, result in zip(groups, results, strict=True):
-            yield result
-            if report is not None:
-                report(group.stop, self.n_pairs)
-
-    def _values(self, pairs):
-        """Linear values (3 * pairs, texels) float32, texels sorted by cluster."""
-        values = [planar_pictures(sample, pairs) for sample in self.samples]
-        values = values[0] if len(values) == 1 else np.concatenate(values, axis=1)
-        return values[:, self.order]
-
-    def frames(self, points, directions):
-        """First frames, from the reduced texels and the principal directions of their clusters."""
-        return [
-            _frame(points[self.order[part]] @ basis)
-            for part, basis in zip(self.parts, directions, strict=True)
-        ]
-
-    def improve(self, frames, components):
-        """One power iteration on the original pictures.
-
-        Returns
-        -------
-        list of (texels, 1 + components or fewer) float32
-            Frames of the best directions in the span of each given frame, once more multiplied by ``A A^T``.
-        """
-        widths = [frame.shape[1] for frame in frames]
-        image = np.zeros((len(self.order), max(widths) - 1), np.float32)
-        grams = [np.zeros((width, width)) for width in widths]
-
-        def work(steps):
-            sums, squares = np.zeros_like(image), [np.zeros_like(gram) for gram in grams]
-            for pairs in steps:
-                values = self._values(pairs)
-                for part, frame, square in zip(self.parts, frames, squares, strict=True):
-                    own = values[:, part]
-                    weights = own @ frame
-                    square += weights.T @ weights
-                    sums[part, : frame.shape[1] - 1] += own.T @ weights[:, 1:]
-            return sums, squares
-
-        for sums, squares in self._groups(work):
-            image += sums
-            for gram, square in zip(grams, squares, strict=True):
-                gram += square
-        improved = []
-        for part, gram in zip(self.parts, grams, strict=True):
-            values, turn = np.linalg.eigh(gram[1:, 1:])
-            values, turn = values[::-1][:components], turn[:, ::-1][:, :components]
-            kept = values > _NOISE**2 * np.trace(gram)
-            improved.append(_frame(image[part, : len(gram) - 1] @ turn[:, kept]))
-        return improved
-
-    def project(self, frames, components):
-        """Bases, their scales (None unless in bytes), and coordinates in the order of the texels."""
-        bases = np.zeros((len(self.parts), self.n_pairs, 3, 1 + components), self.dtypes[0])
-        scales = None
-        if bases.dtype == np.int8:
-            scales = np.zeros(bases.shape[:2], np.float16)
-        coordinates = np.zeros((len(self.order), components), self.dtypes[1])
-        scaled = []
-        for part, frame in zip(self.parts, frames, strict=True):
-            # coordinates of largest magnitude 1; `A^T` of the constant column is the mean times the root of n
-            largest = np.abs(frame[:, 1:]).max(axis=0, initial=0)
-            coordinates[self.order[part], : len(largest)] = frame[:, 1:] / largest
-            scaled.append(frame * np.append(np.float32(1 / math.sqrt(len(frame))), largest))
-
-        def work(steps):
-            for pairs in steps:
-                values = self._values(pairs)
-                for cluster, (part, frame) in enumerate(zip(self.parts, scaled, strict=True)):
-                    found = (values[:, part] @ frame).reshape(-1, 3, frame.shape[1])
-                    if scales is None:
-                        _require_range(bases.dtype, found)
-                    else:
-                        found, scales[cluster, pairs] = _bytes(found)
-                    bases[cluster, pairs, :, : frame.shape[1]] = found
-
-        for _ in self._groups(work):
-            pass
-        return bases, scales, coordinates
-
-
-def _bytes(values):
-    """Values (pairs, 3, n) in whole steps, -127 to 127, and the size of each pair's step, float16."""
-    largest = np.abs(values).max(axis=(1, 2))
-    _require_range(np.float16, largest / 127)
-    steps = (largest / 127).astype(np.float16)
-    size = np.where(steps > 0, steps, np.inf).astype(np.float32)[:, None, None]
-    return np.clip(np.round(values / size), -127, 127), steps
-
-
-def _frame(columns):
-    """A constant column and an orthonormal basis of the columns made orthogonal to it, float32."""
-    n = len(columns)
-    columns = columns[:, : n - 1].astype(np.float64)
-    constant = np.full((n, 1), 1 / math.sqrt(n))
-    columns -= columns.mean(axis=0)
-    basis = np.linalg.qr(np.concatenate([constant, columns], axis=1))[0]
-    basis[:, 0] = constant[:, 0]
-    return basis.astype(np.float32)

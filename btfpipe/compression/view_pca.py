@@ -293,6 +293,7 @@ def _shade(textures, weights, lights, rows, cols, toroidal, row, col, pair, shar
     texel = np.zeros(4, np.int64)
     bilinear = np.zeros(4, np.float32)
     blended = np.zeros(terms, np.float32)
+    local = np.zeros(3 * terms, np.float32)
     for q in range(len(row)):
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
         red = np.float32(0)
@@ -311,17 +312,14 @@ def _shade(textures, weights, lights, rows, cols, toroidal, row, col, pair, shar
             t1 = textures[texel[1], view]
             t2 = textures[texel[2], view]
             t3 = textures[texel[3], view]
+            for k in range(3 * terms):
+                local[k] = (bilinear[0] * t0[k] + bilinear[1] * t1[k]) + (
+                    bilinear[2] * t2[k] + bilinear[3] * t3[k]
+                )
             for k in range(terms):
-                w = blended[k]
-                w0 = w * bilinear[0]
-                w1 = w * bilinear[1]
-                w2 = w * bilinear[2]
-                w3 = w * bilinear[3]
-                red += (w0 * t0[3 * k] + w1 * t1[3 * k]) + (w2 * t2[3 * k] + w3 * t3[3 * k])
-                at = 3 * k + 1
-                green += (w0 * t0[at] + w1 * t1[at]) + (w2 * t2[at] + w3 * t3[at])
-                at = 3 * k + 2
-                blue += (w0 * t0[at] + w1 * t1[at]) + (w2 * t2[at] + w3 * t3[at])
+                red += blended[k] * local[3 * k]
+                green += blended[k] * local[3 * k + 1]
+                blue += blended[k] * local[3 * k + 2]
         out[q, 0] = red
         out[q, 1] = green
         out[q, 2] = blue
