@@ -12,7 +12,7 @@ from btfpipe.cli.options import input_file, progress, stage
 def info(file, threads, quiet):
     """Say what FILE is and what is wrong with it, on stdout.
 
-    FILE may be any of btfpipe's files, a zip or folder of pictures, a picture or a mesh.
+    FILE may be any of btfpipe's files, a measurement in any format that `ingest` reads, a picture or a mesh.
 
     \b
     Example:

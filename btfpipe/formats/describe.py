@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from btfpipe.compression.model import Model
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
+from btfpipe.formats import sources
 from btfpipe.formats.archive import is_zip, open_archive
 from btfpipe.formats.images import Decoder, is_mislabelled, open_picture
 from btfpipe.formats.meshes import ENDINGS, read_mesh
@@ -28,6 +30,9 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
         ``kind``, facts, and ``problems``: a list of sentences.
     """
     path = Path(path)
+    name, reason = sources.recognise(path)
+    if name not in ("ubo", "picture"):
+        return _describe_source(path, name, reason, threads, report)
     if path.is_dir() or is_zip(path):
         try:
             return _describe_set(path, threads, report)
@@ -50,6 +55,86 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
             "problems": [str(error)],
         }
     return describe_picture(picture, path)
+
+
+def _describe_source(path, name, reason, threads, report):
+    """Describe a set or a factorisation by what its reader gives, every picture looked at."""
+    facts = {"kind": f"{name} source", "because": reason}
+    options = {"utia": {"pairs": True}, "curet": {"rectify": False}}.get(name, {})
+    try:
+        opened = sources.open_source(path, name, **options)
+        if isinstance(opened, Model):
+            return facts | _describe_model(opened)
+        with opened as measurement:
+            return facts | _describe_measurement(measurement, threads, report)
+    except InputError as error:
+        return facts | {"problems": [str(error)]}
+
+
+def _describe_model(model):
+    return {
+        "method": model.method,
+        "rows": model.shape[0],
+        "cols": model.shape[1],
+        "pairs": model.n_pairs,
+        "views": describe_directions(model.view_directions),
+        "lights": describe_directions(model.light_directions),
+        "toroidal": model.toroidal,
+        "texels_per_mm": model.texels_per_mm,
+        "source": model.about.get("source"),
+        "problems": [],
+    }
+
+
+def _describe_measurement(measurement, threads, report):
+    def look(pair):
+        try:
+            values = measurement.read(pair)
+        except InputError as error:
+            return None, str(error)
+        return (values.shape[:2], str(values.dtype)), _range(values)
+
+    kinds, unreadable, not_finite = {}, [], []
+    clipped = clipped_pictures = 0
+    looks = ordered_map(look, range(measurement.n_pairs), threads, ahead=8 * threads)
+    for pair, (kind, found) in enumerate(looks):
+        if kind is None:
+            unreadable.append(found)
+            continue
+        kinds.setdefault(kind, []).append(measurement.names[pair])
+        clipped += found.get("clipped", 0)
+        clipped_pictures += found.get("clipped", 0) > 0
+        if found["not_finite"]:
+            not_finite.append(f"{measurement.names[pair]}: {found['not_finite']} values")
+        report(pair + 1, measurement.n_pairs)
+    problems = [
+        *_listed("pictures cannot be read", unreadable),
+        *_listed("pictures hold values that are not finite", not_finite),
+    ]
+    if len(kinds) > 1:
+        sizes = [
+            f"{len(names)} of {shape[0]} x {shape[1]} {dtype} (first {names[0]!r})"
+            for (shape, dtype), names in kinds.items()
+        ]
+        problems.append("pictures differ: " + "; ".join(sizes) + ".")
+    (shape, dtype) = max(kinds, key=lambda kind: len(kinds[kind]), default=((None, None), ""))
+    views, lights = measurement.view_directions, measurement.light_directions
+    return {
+        "rows": shape[0],
+        "cols": shape[1],
+        "stored_as": dtype,
+        "pairs": measurement.n_pairs,
+        "views": describe_directions(views),
+        "lights": describe_directions(lights),
+        "product": measurement.n_pairs == len(views) * len(lights),
+        "clipped_values": clipped,
+        "clipped_pictures": clipped_pictures,
+        "facts": {
+            key: value[:_LISTED] if isinstance(value, list) else value
+            for key, value in measurement.facts.items()
+        },
+        "problems": [*problems, *measurement.facts.get("warnings", [])],
+    }
 
 
 def describe_picture(picture, path):

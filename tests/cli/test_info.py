@@ -271,3 +271,28 @@ def test_a_file_that_vanishes_while_a_folder_is_listed_is_named(
     done = btfpipe("info", path, code=3)
     assert "00003" in done.stderr
     assert "cannot be read (No such file or directory)" in done.stderr
+
+
+@pytest.mark.parametrize("format_", ["utia", "pairs", "rti", "btf"])
+def test_sets_of_every_format_are_described(btfpipe, make_sample, tmp_path, format_):
+    from btfpipe.directions import bonn81
+
+    make_sample(12, 10, lights=bonn81()[:7], views=bonn81()[:3]).save(tmp_path / "s.npz")
+    path = tmp_path / ("s.btf" if format_ == "btf" else "set.zip")
+    btfpipe("export", tmp_path / "s.npz", "--format", format_, "-o", path)
+    facts = json.loads(btfpipe("info", path, "--json").stdout)
+    assert facts["kind"] == f"{format_} source"
+    assert facts["because"]
+    assert (facts["rows"], facts["cols"]) == (12, 10)
+    assert facts["pairs"] == (7 if format_ == "rti" else 21)
+    assert facts["lights"]["number"] == 7
+    assert facts["problems"] == [] or format_ == "utia"
+
+
+def test_a_damaged_set_is_described_by_what_is_wrong(btfpipe, make_sample, tmp_path):
+    make_sample(6, 6).save(tmp_path / "s.npz")
+    btfpipe("export", tmp_path / "s.npz", "--format", "btf", "-o", tmp_path / "s.btf")
+    (tmp_path / "cut.btf").write_bytes((tmp_path / "s.btf").read_bytes()[:-100])
+    facts = json.loads(btfpipe("info", tmp_path / "cut.btf", "--json").stdout)
+    assert len(facts["problems"]) == 1
+    assert "cut.btf" in facts["problems"][0]
