@@ -9,6 +9,7 @@ from btfpipe.sample import Sample
 # Where the Model of each method lives. A further method is one module and a line here.
 MODELS = {
     "svd": "btfpipe.compression.svd:SvdModel",
+    "coded": "btfpipe.compression.coded:CodedModel",
 }
 
 

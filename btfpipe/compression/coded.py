@@ -1,0 +1,366 @@
+"""The transform codec: the SVD of the values' square roots, its factors transformed, quantised and entropy-coded.
+
+What counts is what is seen, and displays have a curve that is near a square root: so the square roots are factorised (Zhou et
+al. 2005 do so with the values), and squared again on evaluation. The file holds both factors after transforms that gather
+their energy in few coefficients:
+
+- eigen-textures by the two-dimensional cosine transform,
+- angular factors by the principal axes of their colours (a luminance and two chroma), of their views and of their lights.
+
+All transforms are orthogonal and so are the factors, so that errors of coefficients add up like errors of values. An
+eigen-texture times its singular value and an angular factor times its singular value are therefore quantised by
+one step for all, the one knob between size and error: weak terms, their chroma first, lose coefficients and
+finally vanish. The rate that a step gives is found by trying. In memory the factors are unpacked.
+"""
+
+import io
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+
+from btfpipe import store
+from btfpipe.compression.entropy import decode_planes, encode_planes
+from btfpipe.compression.model import Model, measured_error
+from btfpipe.compression.svd import compress_svd
+from btfpipe.errors import InputError
+from btfpipe.metrics import raw_bytes
+from btfpipe.parallel import ordered_map, single_threaded_blas
+from btfpipe.sample.transfer import decode_table
+
+_TERMS = 256
+_RATIO = 100.0
+_ROUND = 0.4  # coefficients round up from here: a little more error, clearly fewer bytes
+_SPARE = 1024  # bytes left for what the caller adds to the description
+_LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
+_CLOSE = 0.01  # share of the wanted size by which a file may be smaller
+_MOST_TRIALS = 24
+_LARGEST = 1 << 24  # quantised coefficient: the precision of float32
+
+
+class CodedModel(Model):
+    """A Sample as ``root[texel, pair, channel] = sum_k colour[channel, k] sum_n texture[texel, n] angular_k[pair, n]``.
+
+    Values are ``root * abs(root)``. There are fewer terms for the weaker colours.
+
+    Parameters
+    ----------
+    members : dict
+        The coded factors as the file has them; see `arrays`.
+    source : Appearance
+        Gives directions, index tables, toroidal, texels_per_mm, absolute.
+    about : dict
+        With ``shape``, ``step`` and ``terms`` (of the eigen-textures, then of the three colours).
+
+    Attributes
+    ----------
+    texture_factors : (rows, cols, n) float32
+    angular_factors : list of three (pairs, n_k) float32
+    colour : (3, 3) float32
+    """
+
+    method = "coded"
+
+    def __init__(self, members, source, about):
+        super().__init__(about["shape"], source, about)
+        self.members = dict(members)
+        self.texture_factors, self.angular_factors = _unpack(self.members, self, self.about)
+        self.colour = np.asarray(members["colour"], np.float32)
+
+    @property
+    def n_terms(self):
+        return self.texture_factors.shape[2]
+
+    def arrays(self):
+        """``texture_code`` and ``angular_code``: planes of `entropy`; then the transforms' tables."""
+        return self.members
+
+    @classmethod
+    def from_arrays(cls, reader, source):
+        about = reader.about
+        whole = [about.get("shape"), about.get("terms")]
+        if (
+            [isinstance(a, list) and len(a) for a in whole] != [2, 4]
+            or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
+            or not isinstance(about.get("step"), float)
+            or not 0 < about["step"] < math.inf
+        ):
+            raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
+        n = about["terms"][0]
+        members = {
+            "texture_code": reader.require("texture_code", (None,), "u"),
+            "angular_code": reader.require("angular_code", (None,), "u"),
+            "singular_values": reader.require("singular_values", (n,), "f"),
+            "colour": reader.require("colour", (3, 3), "f"),
+        }
+        for name, count in _bases(source).items():
+            members[name] = reader.require(name, (count, None), "f")
+        try:
+            return cls(members, source, about)
+        except InputError as error:
+            raise InputError(f"{reader.path}: {error}") from error
+
+    def pictures(self, pairs):
+        texture = self.texture_factors.reshape(-1, self.n_terms)
+        roots = [
+            angular[pairs] @ texture[:, : angular.shape[1]].T for angular in self.angular_factors
+        ]
+        return self._values(np.stack(roots, axis=-1)).reshape(-1, *self.shape, 3)
+
+    def texels(self, rows, cols):
+        texture = self.texture_factors[rows, cols]
+        roots = [texture[:, : a.shape[1]] @ a.T for a in self.angular_factors]
+        return self._values(np.stack(roots, axis=-1))
+
+    def _values(self, roots):
+        roots = roots @ self.colour.T
+        return roots * np.abs(roots)
+
+    def shader(self, interpolation="barycentric"):
+        from btfpipe.compression.coded_shading import CodedShader
+
+        return CodedShader(self, interpolation)
+
+
+def compress_coded(
+    sample, ratio=None, *, target_bytes=None, n_terms=_TERMS, seed=0, threads=1, memory=2 << 30,
+    on_progress=None,
+):  # fmt: skip
+    """Compress a Sample into a file of a wanted size.
+
+    Parameters
+    ----------
+    sample : Appearance
+        Read about five times.
+    ratio : float, optional
+        Bytes of the uncompressed pictures (see `raw_bytes`) over those of the file. By default 100, but samples so small
+        that this would leave nothing get what they need.
+    target_bytes : int, optional
+        The file's size instead of the ratio. The file is at most that large, and no more than some per cent smaller
+        unless all that `n_terms` can give fits.
+    n_terms : int
+        Terms made at most; those of no use at this size are left out. More terms are better at low ratios.
+    seed : int
+        Of the random start.
+    threads : int
+        Never changes the result.
+    memory : int
+        Bytes of private memory to stay within.
+    on_progress : callable, optional
+        Called with (pictures read, pictures to read).
+
+    Returns
+    -------
+    CodedModel
+        Its ``about`` holds ``shape``, ``step``, ``terms``, and the measured linear ``rmse`` and ``relative_error``.
+
+    Raises
+    ------
+    InputError
+        If the size is too small for even the tables, or as `compress_svd`.
+    """
+    if ratio is not None and target_bytes is not None:
+        raise InputError("a ratio and a size are given; expected one of them.")
+    if ratio is not None and not 0 < ratio < math.inf:
+        raise InputError(f"ratio {ratio}; expected a positive number.")
+    source = getattr(sample, "about", {}).get("source")
+    spare = _SPARE + len(json.dumps(store.jsonable(source)))
+    if target_bytes is None:
+        target_bytes = int(raw_bytes(sample) / (ratio or _RATIO))
+        if ratio is None:
+            target_bytes = max(target_bytes, _file_bytes({}, sample, {}) + spare + _LEAST)
+    n_pairs = sample.n_pairs
+    report = on_progress or (lambda done, total: None)
+    factors = compress_svd(
+        _Roots(sample), n_terms, iterations=1, precision="single", seed=seed, threads=threads, memory=memory,
+        on_progress=lambda done, total: report(done, total + n_pairs),
+    )  # fmt: skip
+    reads = 0
+    with single_threaded_blas():
+        packer = _Packer(factors)
+        del factors
+        model = packer.fit(target_bytes - spare, threads)
+    model.about |= measured_error(
+        model, sample, threads=threads, on_progress=lambda done, total: report(reads + done, reads + total)
+    )
+    return model
+
+
+class _Roots:
+    """The square roots of an Appearance's values, with their sign."""
+
+    def __init__(self, source):
+        self.source = source
+        for name in (
+            "shape", "n_pairs", "light_directions", "view_directions", "light_index", "view_index",
+            "toroidal", "texels_per_mm", "is_product",
+        ):  # fmt: skip
+            setattr(self, name, getattr(source, name))
+        self.absolute = getattr(source, "absolute", False)
+        codes = getattr(source, "codes", None)
+        self.table = None
+        if codes is not None and codes.dtype == np.uint8 and source.gain is None:
+            self.table = np.sqrt(decode_table(np.uint8, source.transfer, source.scale))
+
+    def pictures(self, pairs):
+        if self.table is not None:
+            return self.table[np.asarray(self.source.codes[pairs])]
+        values = np.asarray(self.source.pictures(pairs), np.float32)
+        return np.copysign(np.sqrt(np.abs(values)), values)
+
+
+def _bases(source):
+    """Names of the members that hold the principal axes, with the number of directions of each."""
+    if not source.is_product:
+        return {}
+    return {"view_basis": len(source.view_directions), "light_basis": len(source.light_directions)}
+
+
+def _principal_axes(values, axis):
+    """Orthonormal columns, by falling energy, of what stands along an axis."""
+    values = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
+    gram = sum(part.T @ part for part in np.array_split(values.astype(np.float64), 16))
+    axes = np.linalg.eigh(gram)[1][:, ::-1]
+    # the sign is arbitrary: the largest entry is positive
+    largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=0)[None], 0)
+    return axes * np.where(largest < 0, -1, 1)
+
+
+class _Packer:
+    """Transformed factors of a Sample, quantised and coded with a step."""
+
+    def __init__(self, factors):
+        from scipy.fft import dctn
+
+        self.source = SimpleNamespace(
+            **{
+                name: getattr(factors, name)
+                for name in (
+                    "shape", "light_directions", "view_directions", "light_index", "view_index",
+                    "toroidal", "texels_per_mm", "absolute", "is_product", "n_pairs",
+                )
+            }
+        )  # fmt: skip
+        n = factors.n_terms
+        texture = factors.texture_factors.transpose(2, 0, 1)
+        weight = np.sqrt((texture.astype(np.float64) ** 2).sum(axis=(1, 2)))
+        weight = np.maximum(weight, np.finfo(np.float32).tiny)
+        self.singular = (weight**2).astype(np.float32)
+        weight = weight.astype(np.float32)[:, None, None]
+        self.texture = dctn(texture, axes=(1, 2), norm="ortho") * weight
+        angular = factors.angular_factors.transpose(2, 0, 1) * weight
+        colour = _principal_axes(angular, 2)
+        self.tables = {"colour": colour}
+        angular = (angular @ colour.astype(np.float32)).transpose(2, 0, 1)
+        if factors.is_product:
+            angular = angular.reshape(3, n, len(factors.view_directions), -1)
+            for name, axis in (("view_basis", 2), ("light_basis", 3)):
+                basis = _principal_axes(angular, axis)
+                self.tables[name] = basis.astype(np.float16)
+                angular = np.moveaxis(
+                    np.moveaxis(angular, axis, -1) @ basis.astype(np.float32), -1, axis
+                )
+        else:
+            angular = angular[:, :, None]
+        self.angular = np.ascontiguousarray(angular)
+
+    def pack(self, step, threads=1):
+        """Members and description for a step."""
+        texture = _quantise(self.texture, step)
+        angular = _quantise(self.angular, step)
+        live = [_live(texture, 0), *(_live(part, 0) for part in angular)]
+        n = max(1, min(live[0], max(live[1:])))
+        terms = [n, *(max(1, min(n, part)) for part in live[1:])]
+        angular = [part[:k] for part, k in zip(angular, terms[1:], strict=True)]
+        members = {
+            "singular_values": self.singular[:n],
+            "colour": self.tables["colour"],
+        }
+        if "view_basis" in self.tables:
+            views, lights = (
+                max(1, *(_live(part, axis) for part in angular)) for axis in (1, 2)
+            )
+            members["view_basis"] = np.ascontiguousarray(self.tables["view_basis"][:, :views])
+            members["light_basis"] = np.ascontiguousarray(self.tables["light_basis"][:, :lights])
+            angular = [part[:, :views, :lights] for part in angular]
+        jobs = [texture[:n], np.concatenate(angular)]
+        members["texture_code"], members["angular_code"] = ordered_map(encode_planes, jobs, threads)
+        return members, {"shape": list(self.source.shape), "step": step, "terms": terms}
+
+    def fit(self, target, threads=1):
+        """The Model whose file is as large as `target` allows."""
+        largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
+        low = math.log(max(largest, 1e-30) / _LARGEST)  # steps, as logarithms
+        high = math.log(max(largest, 1e-30) * 2)
+        step, best, trials = high, None, 0
+        size_high = None
+        while trials < _MOST_TRIALS:
+            members, about = self.pack(math.exp(step), threads)
+            size = _file_bytes(members, self.source, about)
+            trials += 1
+            if size <= target:
+                best, high = (members, about), step
+                if size >= (1 - _CLOSE) * target:
+                    break
+            else:
+                if best is None:
+                    raise InputError(
+                        f"{target} bytes are too few: the smallest possible file takes {size}; ask for a smaller ratio."
+                    )
+                low = step
+            step = (low + high) / 2
+        return CodedModel(best[0], self.source, best[1])
+
+
+def _quantise(values, step):
+    sizes = np.abs(values)
+    sizes *= 1 / step
+    sizes += _ROUND
+    return np.copysign(np.floor(sizes, out=sizes), values).astype(np.int32)
+
+
+def _live(planes, axis):
+    """How far along an axis numbers other than 0 go."""
+    others = tuple(a for a in range(planes.ndim) if a != axis)
+    found = np.flatnonzero(planes.any(axis=others))
+    return int(found[-1]) + 1 if len(found) else 0
+
+
+def _file_bytes(members, source, about):
+    """Size of the file that a Model of these members is saved to."""
+    file = io.BytesIO()
+    writer = store.Writer(file)
+    for name, array in members.items():
+        writer.array(name, array)
+    for name in ("light_directions", "view_directions", "light_index", "view_index"):
+        writer.array(name, getattr(source, name))
+    writer.about(about)
+    writer.close()
+    return len(file.getvalue())
+
+
+def _unpack(members, source, about):
+    """Texture factors (rows, cols, n) and the three angular factors (pairs, n_k), float32, of coded members."""
+    from scipy.fft import idctn
+
+    n, *terms = about["terms"]
+    singular = np.asarray(members["singular_values"], np.float32)
+    texture = decode_planes(members["texture_code"], (n, *source.shape))
+    texture = texture * (np.float32(about["step"]) / singular)[:, None, None]
+    texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
+    if "view_basis" in members:
+        view, light = (np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light"))
+        shape = (view.shape[1], light.shape[1])
+    else:
+        shape = (1, source.n_pairs)
+    planes = decode_planes(members["angular_code"], (sum(terms), *shape))
+    planes = planes * np.float32(about["step"])
+    if "view_basis" in members:
+        planes = view @ planes @ light.T
+    planes = planes.reshape(len(planes), -1)
+    parts = np.split(planes, np.cumsum(terms)[:-1])
+    # balanced, as in `SvdModel`
+    return np.ascontiguousarray(texture.transpose(1, 2, 0)), [
+        np.ascontiguousarray(part.T) for part in parts
+    ]
