@@ -22,20 +22,22 @@ import numpy as np
 
 from btfpipe import store
 from btfpipe.compression.entropy import decode_planes, encode_planes
-from btfpipe.compression.model import Model, measured_error
+from btfpipe.compression.model import Model, measured_error, tables
 from btfpipe.compression.svd import compress_svd
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
-from btfpipe.parallel import ordered_map, single_threaded_blas
+from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
 
 _TERMS = 256
 _RATIO = 100.0
 _ROUND = 0.4  # coefficients round up from here: a little more error, clearly fewer bytes
+_SPARSE = 400  # a colour of a term with fewer coefficients than one in so many is not worth its time in shading
 _SPARE = 1024  # bytes left for what the caller adds to the description
 _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
 _CLOSE = 0.01  # share of the wanted size by which a file may be smaller
 _MOST_TRIALS = 24
+_BLOCK = 1 << 14  # rows a matrix product, fixed
 _LARGEST = 1 << 24  # quantised coefficient: the precision of float32
 
 
@@ -94,8 +96,10 @@ class CodedModel(Model):
             "singular_values": reader.require("singular_values", (n,), "f"),
             "colour": reader.require("colour", (3, 3), "f"),
         }
-        for name, count in _bases(source).items():
-            members[name] = reader.require(name, (count, None), "f")
+        if "view_basis" in reader:
+            for name in ("view", "light"):
+                count = len(getattr(source, f"{name}_directions"))
+                members[f"{name}_basis"] = reader.require(f"{name}_basis", (count, None), "f")
         try:
             return cls(members, source, about)
         except InputError as error:
@@ -124,7 +128,7 @@ class CodedModel(Model):
 
 
 def compress_coded(
-    sample, ratio=None, *, target_bytes=None, n_terms=_TERMS, seed=0, threads=1, memory=2 << 30,
+    sample, ratio=None, *, target_bytes=None, n_terms=None, seed=0, threads=1, memory=2 << 30,
     on_progress=None,
 ):  # fmt: skip
     """Compress a Sample into a file of a wanted size.
@@ -139,8 +143,9 @@ def compress_coded(
     target_bytes : int, optional
         The file's size instead of the ratio. The file is at most that large, and no more than some per cent smaller
         unless all that `n_terms` can give fits.
-    n_terms : int
-        Terms made at most; those of no use at this size are left out. More terms are better at low ratios.
+    n_terms : int, optional
+        Terms made at most, by default 256, or as many as a plain SVD of the same size has; those of no use at this size
+        are left out. Fewer shade faster, more help at low ratios.
     seed : int
         Of the random start.
     threads : int
@@ -170,19 +175,39 @@ def compress_coded(
         target_bytes = int(raw_bytes(sample) / (ratio or _RATIO))
         if ratio is None:
             target_bytes = max(target_bytes, _file_bytes({}, sample, {}) + spare + _LEAST)
+    lengths = sample.shape[0] * sample.shape[1] + 3 * sample.n_pairs
+    if n_terms is None:
+        n_terms = max(_TERMS, target_bytes // (2 * lengths))
+    most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
+    # factors, transformed, quantised, with what that takes, and unpacked again
+    need = (104 << 20) + 4 * 7 * most * lengths
+    if need > memory:
+        raise InputError(
+            f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
+            f" {memory >> 20} MB. Raise it, or ask for fewer terms."
+        )
     n_pairs = sample.n_pairs
     report = on_progress or (lambda done, total: None)
+    reads = 0
+
+    def first(done, total):
+        nonlocal reads
+        reads = total
+        report(done, total + n_pairs)
+
     factors = compress_svd(
         _Roots(sample), n_terms, iterations=1, precision="single", seed=seed, threads=threads, memory=memory,
-        on_progress=lambda done, total: report(done, total + n_pairs),
+        on_progress=first,
     )  # fmt: skip
-    reads = 0
     with single_threaded_blas():
         packer = _Packer(factors)
         del factors
         model = packer.fit(target_bytes - spare, threads)
     model.about |= measured_error(
-        model, sample, threads=threads, on_progress=lambda done, total: report(reads + done, reads + total)
+        model,
+        sample,
+        threads=threads,
+        on_progress=lambda done, total: report(reads + done, reads + total),
     )
     return model
 
@@ -210,17 +235,13 @@ class _Roots:
         return np.copysign(np.sqrt(np.abs(values)), values)
 
 
-def _bases(source):
-    """Names of the members that hold the principal axes, with the number of directions of each."""
-    if not source.is_product:
-        return {}
-    return {"view_basis": len(source.view_directions), "light_basis": len(source.light_directions)}
-
-
 def _principal_axes(values, axis):
     """Orthonormal columns, by falling energy, of what stands along an axis."""
     values = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
-    gram = sum(part.T @ part for part in np.array_split(values.astype(np.float64), 16))
+    gram = np.zeros((values.shape[1],) * 2)
+    for part in blocks(len(values), _BLOCK):
+        some = values[part].astype(np.float64)
+        gram += some.T @ some
     axes = np.linalg.eigh(gram)[1][:, ::-1]
     # the sign is arbitrary: the largest entry is positive
     largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=0)[None], 0)
@@ -245,7 +266,7 @@ class _Packer:
         n = factors.n_terms
         texture = factors.texture_factors.transpose(2, 0, 1)
         weight = np.sqrt((texture.astype(np.float64) ** 2).sum(axis=(1, 2)))
-        weight = np.maximum(weight, np.finfo(np.float32).tiny)
+        weight[weight == 0] = 1
         self.singular = (weight**2).astype(np.float32)
         weight = weight.astype(np.float32)[:, None, None]
         self.texture = dctn(texture, axes=(1, 2), norm="ortho") * weight
@@ -269,7 +290,8 @@ class _Packer:
         """Members and description for a step."""
         texture = _quantise(self.texture, step)
         angular = _quantise(self.angular, step)
-        live = [_live(texture, 0), *(_live(part, 0) for part in angular)]
+        least = max(1, angular[0, 0].size // _SPARSE)
+        live = [_live(texture, 0), *(_live(part, 0, least) for part in angular)]
         n = max(1, min(live[0], max(live[1:])))
         terms = [n, *(max(1, min(n, part)) for part in live[1:])]
         angular = [part[:k] for part, k in zip(angular, terms[1:], strict=True)]
@@ -278,9 +300,9 @@ class _Packer:
             "colour": self.tables["colour"],
         }
         if "view_basis" in self.tables:
-            views, lights = (
-                max(1, *(_live(part, axis) for part in angular)) for axis in (1, 2)
-            )
+            kept = np.concatenate(angular)
+            # an axis is kept if it saves more than its own bytes
+            views, lights = (max(1, _live(kept, axis, 2 * kept.shape[axis])) for axis in (1, 2))
             members["view_basis"] = np.ascontiguousarray(self.tables["view_basis"][:, :views])
             members["light_basis"] = np.ascontiguousarray(self.tables["light_basis"][:, :lights])
             angular = [part[:, :views, :lights] for part in angular]
@@ -291,25 +313,38 @@ class _Packer:
     def fit(self, target, threads=1):
         """The Model whose file is as large as `target` allows."""
         largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
-        low = math.log(max(largest, 1e-30) / _LARGEST)  # steps, as logarithms
-        high = math.log(max(largest, 1e-30) * 2)
-        step, best, trials = high, None, 0
-        size_high = None
-        while trials < _MOST_TRIALS:
-            members, about = self.pack(math.exp(step), threads)
-            size = _file_bytes(members, self.source, about)
-            trials += 1
-            if size <= target:
-                best, high = (members, about), step
-                if size >= (1 - _CLOSE) * target:
-                    break
+        sizes = {}
+
+        def attempt(step):
+            members, about = self.pack(step, threads)
+            sizes[step] = _file_bytes(members, self.source, about)
+            return sizes[step] <= target, members, about
+
+        coarse = 2 * largest or 1.0  # all coefficients are 0
+        fits, *best = attempt(coarse)
+        if not fits:
+            raise InputError(
+                f"{target} bytes are too few: tables and description alone take {sizes[coarse]}. Ask for a smaller ratio."
+            )
+        finest = max(largest / _LARGEST, np.finfo(np.float32).tiny)
+        fine = coarse
+        while fits and fine > finest:  # coarse steps are quick
+            coarse, fine = fine, max(fine / 4, finest)
+            fits, *found = attempt(fine)
+            best = found if fits else best
+        for trial in range(_MOST_TRIALS):
+            if fits or sizes[coarse] >= (1 - _CLOSE) * target:
+                break
+            # sizes are near a power of the step
+            span = math.log(sizes[fine] / sizes[coarse])
+            place = math.log(sizes[fine] / ((1 - _CLOSE / 2) * target)) / span
+            place = min(max(place, 0.05), 0.95) if trial % 3 < 2 else 0.5
+            step = math.exp(math.log(fine) + place * math.log(coarse / fine))
+            fewer, *found = attempt(step)
+            if fewer:
+                coarse, best = step, found
             else:
-                if best is None:
-                    raise InputError(
-                        f"{target} bytes are too few: the smallest possible file takes {size}; ask for a smaller ratio."
-                    )
-                low = step
-            step = (low + high) / 2
+                fine = step
         return CodedModel(best[0], self.source, best[1])
 
 
@@ -320,10 +355,10 @@ def _quantise(values, step):
     return np.copysign(np.floor(sizes, out=sizes), values).astype(np.int32)
 
 
-def _live(planes, axis):
-    """How far along an axis numbers other than 0 go."""
+def _live(planes, axis, least=1):
+    """How far along an axis there are at least so many numbers other than 0."""
     others = tuple(a for a in range(planes.ndim) if a != axis)
-    found = np.flatnonzero(planes.any(axis=others))
+    found = np.flatnonzero(np.count_nonzero(planes, axis=others) >= least)
     return int(found[-1]) + 1 if len(found) else 0
 
 
@@ -333,7 +368,7 @@ def _file_bytes(members, source, about):
     writer = store.Writer(file)
     for name, array in members.items():
         writer.array(name, array)
-    for name in ("light_directions", "view_directions", "light_index", "view_index"):
+    for name in tables(source):
         writer.array(name, getattr(source, name))
     writer.about(about)
     writer.close()
@@ -347,20 +382,28 @@ def _unpack(members, source, about):
     n, *terms = about["terms"]
     singular = np.asarray(members["singular_values"], np.float32)
     texture = decode_planes(members["texture_code"], (n, *source.shape))
-    texture = texture * (np.float32(about["step"]) / singular)[:, None, None]
+    texture = texture.astype(np.float32)
+    texture *= (np.float32(about["step"]) / singular)[:, None, None]
     texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
     if "view_basis" in members:
-        view, light = (np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light"))
+        view, light = (
+            np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light")
+        )
+        if len(view) * len(light) != source.n_pairs:
+            raise InputError(
+                f"{source.n_pairs} pairs; expected {len(view)} views times {len(light)} lights."
+            )
         shape = (view.shape[1], light.shape[1])
     else:
         shape = (1, source.n_pairs)
     planes = decode_planes(members["angular_code"], (sum(terms), *shape))
-    planes = planes * np.float32(about["step"])
+    planes = planes.astype(np.float32)
+    planes *= np.float32(about["step"])
     if "view_basis" in members:
-        planes = view @ planes @ light.T
+        with single_threaded_blas():
+            planes = view @ planes @ light.T
     planes = planes.reshape(len(planes), -1)
     parts = np.split(planes, np.cumsum(terms)[:-1])
-    # balanced, as in `SvdModel`
     return np.ascontiguousarray(texture.transpose(1, 2, 0)), [
         np.ascontiguousarray(part.T) for part in parts
     ]

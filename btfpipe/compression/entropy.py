@@ -9,6 +9,7 @@ The coder is the carry-propagating one of Martin 1979 in the form that Subbotin 
 fast and a slow estimate.
 """
 
+import math
 import zlib
 
 import numpy as np
@@ -25,6 +26,7 @@ _UNARY = 14  # magnitudes from here on go on in Exp-Golomb code
 _FAST, _SLOW = 4, 7
 _TOP = 1 << 24
 _HALF = 1 << 15
+_DENSEST = 15_200  # numbers a byte: the chance of a zero is 65,512 of 65,536 at most
 _HEADER = 8  # bytes: checksum and length of what follows
 
 
@@ -67,6 +69,8 @@ def decode_planes(coded, shape):
         raise InputError(f"{len(data)} coded bytes; expected {size + _HEADER}: cut off.")
     if zlib.crc32(body) != crc:
         raise InputError("the coded bytes do not have their checksum: damaged.")
+    if math.prod(shape) > _DENSEST * (size + 1):
+        raise InputError(f"{size} coded bytes cannot hold {shape} numbers: damaged.")
     planes = np.zeros(shape, np.int32)
     if not _decode(np.frombuffer(body, np.uint8), planes, *_models()):
         raise InputError(f"the coded bytes end before {shape} numbers: damaged.")
