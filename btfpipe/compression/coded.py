@@ -144,8 +144,8 @@ def compress_coded(
         The file's size instead of the ratio. The file is at most that large, and no more than some per cent smaller
         unless all that `n_terms` can give fits.
     n_terms : int, optional
-        Terms made at most, by default 256, or as many as a plain SVD of the same size has; those of no use at this size
-        are left out. Fewer shade faster, more help at low ratios.
+        Terms made at most; those of no use at this size are left out. Fewer shade faster, more help at low ratios. By
+        default 256, three times those of a plain SVD of the same size up to 512, and never fewer than it has.
     seed : int
         Of the random start.
     threads : int
@@ -177,7 +177,8 @@ def compress_coded(
             target_bytes = max(target_bytes, _file_bytes({}, sample, {}) + spare + _LEAST)
     lengths = sample.shape[0] * sample.shape[1] + 3 * sample.n_pairs
     if n_terms is None:
-        n_terms = max(_TERMS, target_bytes // (2 * lengths))
+        plain = target_bytes // (2 * lengths)
+        n_terms = max(_TERMS, plain, min(3 * plain, 2 * _TERMS))
     most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
     # factors, transformed, quantised, with what that takes, and unpacked again
     need = (104 << 20) + 4 * 7 * most * lengths
