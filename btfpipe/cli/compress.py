@@ -2,10 +2,10 @@
 
 import click
 
-from btfpipe.cli.options import Memory, input_file, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, Memory, input_file, naming, progress, stage
 
 # As in btfpipe.compression.METHODS, which is not imported for --help.
-_METHODS = ("svd", "view-pca", "local-pca", "harmonics", "factored")
+_METHODS = ("coded", "svd", "view-pca", "local-pca", "harmonics", "factored")
 _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 
 
@@ -14,16 +14,22 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 @click.option(
     "--method",
     type=click.Choice(_METHODS),
-    default="svd",
+    default="coded",
     show_default=True,
-    help="svd: full-matrix singular value decomposition (Zhou et al. 2005). view-pca: principal pictures of each view (Wang et"
+    help="coded: square roots of the values factorised, quantised and entropy-coded to a wanted size; best by far for its bytes. svd: full-matrix singular value decomposition (Zhou et al. 2005). view-pca: principal pictures of each view (Wang et"
     " al. 2009). local-pca: clusters of texels with a PCA each (Müller et al. 2007); several samples make a database. harmonics:"
     " spherical harmonics over views and lights (Leung et al. 2007). factored: channel by channel, as in Bonn's .btf files.",
 )
 @click.option(
     "--components",
     type=click.IntRange(min=1),
-    help="Terms of the sum: of svd, of each view, of each cluster.  [default: svd 40, view-pca 5, local-pca 8]",
+    help="Terms of the sum: of coded and svd, of each view, of each cluster.  [default: coded as the size asks, svd 40, view-pca 5,"
+    " local-pca 8]",
+)
+@click.option(
+    "--ratio",
+    type=FiniteFloat(min=1),
+    help="Bytes of the pictures over those of the file, for coded.  [default: 100]",
 )
 @click.option(
     "--space",
@@ -45,7 +51,7 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 @click.option(
     "--target-bytes",
     type=Memory(),
-    help="Size of the file, for local-pca, such as 800K.",
+    help="Size of the file, for coded and local-pca, such as 800K.",
 )
 @click.option(
     "--view-harmonics",
@@ -59,8 +65,8 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 )
 @click.option(
     "--precision",
-    type=click.Choice(["half", "single"]),
-    help="Numbers in the file: 2 or 4 bytes each.  [default: half]",
+    type=click.Choice(["half", "single", "byte"]),
+    help="Numbers in the file: 2, 4 or 1 bytes each; byte for view-pca and local-pca.  [default: half]",
 )
 @click.option(
     "--iterations",
@@ -75,7 +81,9 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
 
     \b
     Example:
-      btfpipe compress corduroy.sample.npz -o corduroy.model.npz --components 40
+      btfpipe compress corduroy.sample.npz -o corduroy.model.npz
+      btfpipe compress corduroy.sample.npz --method svd --components 40 -o corduroy.model.npz
+      btfpipe compress wool.sample.npz felt.sample.npz --method local-pca -o cloth.model.npz
     """
     from btfpipe import store
     from btfpipe.compression import DATABASES, METHODS
@@ -86,6 +94,8 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
     if options["space"] is not None:
         options["space"] = _SPACES[options["space"]]
     takes = METHODS[method].options
+    if options["ratio"] is not None and options["target_bytes"] is not None:
+        raise click.UsageError("--ratio and --target-bytes are two ways to say the same; give one.")
     if method == "svd":
         takes = takes | {"space": None, "channel_components": None}
     for name, value in options.items():
@@ -103,6 +113,7 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
         model = compress_samples(
             opened, method, seed=seed, threads=threads, memory=memory, on_progress=report, **options
         )
+    model.about.setdefault("n_terms", getattr(model, "n_terms", None))
     raw = sum(raw_bytes(sample) for sample in opened)
     warnings = model.about.pop("warnings", [])
     model.about |= {

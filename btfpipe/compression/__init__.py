@@ -53,6 +53,12 @@ METHODS = {
         "compress_harmonics",
         {"view_harmonics": "view_terms", "light_harmonics": "light_terms"},
     ),
+    "coded": Method(
+        "btfpipe.compression.coded",
+        "CodedModel",
+        "compress_coded",
+        {"ratio": "ratio", "target_bytes": "target_bytes", "components": "n_terms"},
+    ),
     "relighting": Method("btfpipe.compression.relighting", "RelightingModel", None, {}),
 }
 DATABASES = ("local-pca",)  # methods that take several samples at once

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfpipe import store
+from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import Appearance
 
@@ -61,8 +62,8 @@ class Model(Appearance):
             "texels_per_mm": self.texels_per_mm,
             "absolute": self.absolute,
         }
-        tables = {name: getattr(self, name) for name in _TABLES}
-        store.write(path, "model", tables | self.arrays(), **about)
+        members = {name: getattr(self, name) for name in tables(self)}
+        store.write(path, "model", members | self.arrays(), **about)
 
     @property
     def nbytes(self):
@@ -70,14 +71,30 @@ class Model(Appearance):
         return int(sum(array.nbytes for array in arrays))
 
 
+def tables(source):
+    """Names of the tables that a Model's file holds: of a product, whose pairs follow a rule, directions alone."""
+    return _TABLES[:2] if source.is_product else _TABLES
+
+
 def read_tables(reader):
     """Directions, index tables and facts of a Model's file, as attributes."""
     about = reader.about
+    lights = reader.require("light_directions", (None, 3), "f")
+    views = reader.require("view_directions", (None, 3), "f")
+    if "light_index" in reader:
+        index = [reader.require(name, (None,), "iu") for name in _TABLES[2:]]
+        if len(index[0]) != len(index[1]):
+            raise InputError(
+                f"{reader.path}: {len(index[0])} lights and {len(index[1])} views of pairs; expected as many."
+            )
+    else:
+        pair = np.arange(len(lights) * len(views), dtype=np.int32)
+        index = [pair % len(lights), pair // len(lights)]
     return SimpleNamespace(
-        light_directions=reader.require("light_directions", (None, 3), "f"),
-        view_directions=reader.require("view_directions", (None, 3), "f"),
-        light_index=reader.require("light_index", (None,), "iu"),
-        view_index=reader.require("view_index", (None,), "iu"),
+        light_directions=lights,
+        view_directions=views,
+        light_index=index[0],
+        view_index=index[1],
         toroidal=about["toroidal"],
         texels_per_mm=about["texels_per_mm"],
         absolute=about["absolute"],

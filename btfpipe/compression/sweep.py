@@ -12,6 +12,7 @@ from btfpipe.metrics.comparison import compare
 
 # Settings that a sweep tries, by method: from the smallest file to the largest.
 SETTINGS = {
+    "coded": [{"ratio": ratio} for ratio in (400.0, 200.0, 100.0, 50.0, 25.0)],
     "svd": [{"components": n} for n in (4, 8, 16, 32, 64, 128)],
     "view-pca": [{"components": n} for n in (1, 2, 5, 10, 20)],
     "local-pca": [{"clusters": n, "components": 8} for n in (1, 2, 4, 8, 16)],

@@ -1,0 +1,410 @@
+"""The transform codec: the SVD of the values' square roots, its factors transformed, quantised and entropy-coded.
+
+What counts is what is seen, and displays have a curve that is near a square root: so the square roots are factorised (Zhou et
+al. 2005 do so with the values), and squared again on evaluation. The file holds both factors after transforms that gather
+their energy in few coefficients:
+
+- eigen-textures by the two-dimensional cosine transform,
+- angular factors by the principal axes of their colours (a luminance and two chroma), of their views and of their lights.
+
+All transforms are orthogonal and so are the factors, so that errors of coefficients add up like errors of values. An
+eigen-texture times its singular value and an angular factor times its singular value are therefore quantised by
+one step for all, the one knob between size and error: weak terms, their chroma first, lose coefficients and
+finally vanish. The rate that a step gives is found by trying. In memory the factors are unpacked.
+"""
+
+import io
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+
+from btfpipe import store
+from btfpipe.compression.entropy import decode_planes, encode_planes
+from btfpipe.compression.model import Model, measured_error, tables
+from btfpipe.compression.svd import compress_svd
+from btfpipe.errors import InputError
+from btfpipe.metrics import raw_bytes
+from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.transfer import decode_table
+
+_TERMS = 256
+_RATIO = 100.0
+_ROUND = 0.4  # coefficients round up from here: a little more error, clearly fewer bytes
+_SPARSE = 400  # a colour of a term with fewer coefficients than one in so many is not worth its time in shading
+_SPARE = 1024  # bytes left for what the caller adds to the description
+_LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
+_CLOSE = 0.01  # share of the wanted size by which a file may be smaller
+_MOST_TRIALS = 24
+_BLOCK = 1 << 14  # rows a matrix product, fixed
+_LARGEST = 1 << 24  # quantised coefficient: the precision of float32
+
+
+class CodedModel(Model):
+    """A Sample as ``root[texel, pair, channel] = sum_k colour[channel, k] sum_n texture[texel, n] angular_k[pair, n]``.
+
+    Values are ``root * abs(root)``. There are fewer terms for the weaker colours.
+
+    Parameters
+    ----------
+    members : dict
+        The coded factors as the file has them; see `arrays`.
+    source : Appearance
+        Gives directions, index tables, toroidal, texels_per_mm, absolute.
+    about : dict
+        With ``shape``, ``step`` and ``terms`` (of the eigen-textures, then of the three colours).
+
+    Attributes
+    ----------
+    texture_factors : (rows, cols, n) float32
+    angular_factors : list of three (pairs, n_k) float32
+    colour : (3, 3) float32
+    """
+
+    method = "coded"
+
+    def __init__(self, members, source, about):
+        super().__init__(about["shape"], source, about)
+        self.members = dict(members)
+        self.texture_factors, self.angular_factors = _unpack(self.members, self, self.about)
+        self.colour = np.asarray(members["colour"], np.float32)
+
+    @property
+    def n_terms(self):
+        return self.texture_factors.shape[2]
+
+    def arrays(self):
+        """``texture_code`` and ``angular_code``: planes of `entropy`; then the transforms' tables."""
+        return self.members
+
+    @classmethod
+    def from_arrays(cls, reader, source):
+        about = reader.about
+        whole = [about.get("shape"), about.get("terms")]
+        if (
+            [isinstance(a, list) and len(a) for a in whole] != [2, 4]
+            or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
+            or not isinstance(about.get("step"), float)
+            or not 0 < about["step"] < math.inf
+        ):
+            raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
+        n = about["terms"][0]
+        members = {
+            "texture_code": reader.require("texture_code", (None,), "u"),
+            "angular_code": reader.require("angular_code", (None,), "u"),
+            "singular_values": reader.require("singular_values", (n,), "f"),
+            "colour": reader.require("colour", (3, 3), "f"),
+        }
+        if "view_basis" in reader:
+            for name in ("view", "light"):
+                count = len(getattr(source, f"{name}_directions"))
+                members[f"{name}_basis"] = reader.require(f"{name}_basis", (count, None), "f")
+        try:
+            return cls(members, source, about)
+        except InputError as error:
+            raise InputError(f"{reader.path}: {error}") from error
+
+    def pictures(self, pairs):
+        texture = self.texture_factors.reshape(-1, self.n_terms)
+        roots = [
+            angular[pairs] @ texture[:, : angular.shape[1]].T for angular in self.angular_factors
+        ]
+        return self._values(np.stack(roots, axis=-1)).reshape(-1, *self.shape, 3)
+
+    def texels(self, rows, cols):
+        texture = self.texture_factors[rows, cols]
+        roots = [texture[:, : a.shape[1]] @ a.T for a in self.angular_factors]
+        return self._values(np.stack(roots, axis=-1))
+
+    def _values(self, roots):
+        roots = roots @ self.colour.T
+        return roots * np.abs(roots)
+
+    def shader(self, interpolation="barycentric"):
+        from btfpipe.compression.coded_shading import CodedShader
+
+        return CodedShader(self, interpolation)
+
+
+def compress_coded(
+    sample, ratio=None, *, target_bytes=None, n_terms=None, seed=0, threads=1, memory=2 << 30,
+    on_progress=None,
+):  # fmt: skip
+    """Compress a Sample into a file of a wanted size.
+
+    Parameters
+    ----------
+    sample : Appearance
+        Read about five times.
+    ratio : float, optional
+        Bytes of the uncompressed pictures (see `raw_bytes`) over those of the file. By default 100, but samples so small
+        that this would leave nothing get what they need.
+    target_bytes : int, optional
+        The file's size instead of the ratio. The file is at most that large, and no more than some per cent smaller
+        unless all that `n_terms` can give fits.
+    n_terms : int, optional
+        Terms made at most; those of no use at this size are left out. Fewer shade faster, more help at low ratios. By
+        default 256, three times those of a plain SVD of the same size up to 512, and never fewer than it has.
+    seed : int
+        Of the random start.
+    threads : int
+        Never changes the result.
+    memory : int
+        Bytes of private memory to stay within.
+    on_progress : callable, optional
+        Called with (pictures read, pictures to read).
+
+    Returns
+    -------
+    CodedModel
+        Its ``about`` holds ``shape``, ``step``, ``terms``, and the measured linear ``rmse`` and ``relative_error``.
+
+    Raises
+    ------
+    InputError
+        If the size is too small for even the tables, or as `compress_svd`.
+    """
+    if ratio is not None and target_bytes is not None:
+        raise InputError("a ratio and a size are given; expected one of them.")
+    if ratio is not None and not 0 < ratio < math.inf:
+        raise InputError(f"ratio {ratio}; expected a positive number.")
+    source = getattr(sample, "about", {}).get("source")
+    spare = _SPARE + len(json.dumps(store.jsonable(source)))
+    if target_bytes is None:
+        target_bytes = int(raw_bytes(sample) / (ratio or _RATIO))
+        if ratio is None:
+            target_bytes = max(target_bytes, _file_bytes({}, sample, {}) + spare + _LEAST)
+    lengths = sample.shape[0] * sample.shape[1] + 3 * sample.n_pairs
+    if n_terms is None:
+        plain = target_bytes // (2 * lengths)
+        n_terms = max(_TERMS, plain, min(3 * plain, 2 * _TERMS))
+    most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
+    # factors, transformed, quantised, with what that takes, and unpacked again
+    need = (104 << 20) + 4 * 7 * most * lengths
+    if need > memory:
+        raise InputError(
+            f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
+            f" {memory >> 20} MB. Raise it, or ask for fewer terms."
+        )
+    n_pairs = sample.n_pairs
+    report = on_progress or (lambda done, total: None)
+    reads = 0
+
+    def first(done, total):
+        nonlocal reads
+        reads = total
+        report(done, total + n_pairs)
+
+    factors = compress_svd(
+        _Roots(sample), n_terms, iterations=1, precision="single", seed=seed, threads=threads, memory=memory,
+        on_progress=first,
+    )  # fmt: skip
+    with single_threaded_blas():
+        packer = _Packer(factors)
+        del factors
+        model = packer.fit(target_bytes - spare, threads)
+    model.about |= measured_error(
+        model,
+        sample,
+        threads=threads,
+        on_progress=lambda done, total: report(reads + done, reads + total),
+    )
+    return model
+
+
+class _Roots:
+    """The square roots of an Appearance's values, with their sign."""
+
+    def __init__(self, source):
+        self.source = source
+        for name in (
+            "shape", "n_pairs", "light_directions", "view_directions", "light_index", "view_index",
+            "toroidal", "texels_per_mm", "is_product",
+        ):  # fmt: skip
+            setattr(self, name, getattr(source, name))
+        self.absolute = getattr(source, "absolute", False)
+        codes = getattr(source, "codes", None)
+        self.table = None
+        if codes is not None and codes.dtype == np.uint8 and source.gain is None:
+            self.table = np.sqrt(decode_table(np.uint8, source.transfer, source.scale))
+
+    def pictures(self, pairs):
+        if self.table is not None:
+            return self.table[np.asarray(self.source.codes[pairs])]
+        values = np.asarray(self.source.pictures(pairs), np.float32)
+        return np.copysign(np.sqrt(np.abs(values)), values)
+
+
+def _principal_axes(values, axis):
+    """Orthonormal columns, by falling energy, of what stands along an axis."""
+    values = np.moveaxis(values, axis, -1).reshape(-1, values.shape[axis])
+    gram = np.zeros((values.shape[1],) * 2)
+    for part in blocks(len(values), _BLOCK):
+        some = values[part].astype(np.float64)
+        gram += some.T @ some
+    axes = np.linalg.eigh(gram)[1][:, ::-1]
+    # the sign is arbitrary: the largest entry is positive
+    largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=0)[None], 0)
+    return axes * np.where(largest < 0, -1, 1)
+
+
+class _Packer:
+    """Transformed factors of a Sample, quantised and coded with a step."""
+
+    def __init__(self, factors):
+        from scipy.fft import dctn
+
+        self.source = SimpleNamespace(
+            **{
+                name: getattr(factors, name)
+                for name in (
+                    "shape", "light_directions", "view_directions", "light_index", "view_index",
+                    "toroidal", "texels_per_mm", "absolute", "is_product", "n_pairs",
+                )
+            }
+        )  # fmt: skip
+        n = factors.n_terms
+        texture = factors.texture_factors.transpose(2, 0, 1)
+        weight = np.sqrt((texture.astype(np.float64) ** 2).sum(axis=(1, 2)))
+        weight[weight == 0] = 1
+        self.singular = (weight**2).astype(np.float32)
+        weight = weight.astype(np.float32)[:, None, None]
+        self.texture = dctn(texture, axes=(1, 2), norm="ortho") * weight
+        angular = factors.angular_factors.transpose(2, 0, 1) * weight
+        colour = _principal_axes(angular, 2)
+        self.tables = {"colour": colour}
+        angular = (angular @ colour.astype(np.float32)).transpose(2, 0, 1)
+        if factors.is_product:
+            angular = angular.reshape(3, n, len(factors.view_directions), -1)
+            for name, axis in (("view_basis", 2), ("light_basis", 3)):
+                basis = _principal_axes(angular, axis)
+                self.tables[name] = basis.astype(np.float16)
+                angular = np.moveaxis(
+                    np.moveaxis(angular, axis, -1) @ basis.astype(np.float32), -1, axis
+                )
+        else:
+            angular = angular[:, :, None]
+        self.angular = np.ascontiguousarray(angular)
+
+    def pack(self, step, threads=1):
+        """Members and description for a step."""
+        texture = _quantise(self.texture, step)
+        angular = _quantise(self.angular, step)
+        least = max(1, angular[0, 0].size // _SPARSE)
+        live = [_live(texture, 0), *(_live(part, 0, least) for part in angular)]
+        n = max(1, min(live[0], max(live[1:])))
+        terms = [n, *(max(1, min(n, part)) for part in live[1:])]
+        angular = [part[:k] for part, k in zip(angular, terms[1:], strict=True)]
+        members = {
+            "singular_values": self.singular[:n],
+            "colour": self.tables["colour"],
+        }
+        if "view_basis" in self.tables:
+            kept = np.concatenate(angular)
+            # an axis is kept if it saves more than its own bytes
+            views, lights = (max(1, _live(kept, axis, 2 * kept.shape[axis])) for axis in (1, 2))
+            members["view_basis"] = np.ascontiguousarray(self.tables["view_basis"][:, :views])
+            members["light_basis"] = np.ascontiguousarray(self.tables["light_basis"][:, :lights])
+            angular = [part[:, :views, :lights] for part in angular]
+        jobs = [texture[:n], np.concatenate(angular)]
+        members["texture_code"], members["angular_code"] = ordered_map(encode_planes, jobs, threads)
+        return members, {"shape": list(self.source.shape), "step": step, "terms": terms}
+
+    def fit(self, target, threads=1):
+        """The Model whose file is as large as `target` allows."""
+        largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
+        sizes = {}
+
+        def attempt(step):
+            members, about = self.pack(step, threads)
+            sizes[step] = _file_bytes(members, self.source, about)
+            return sizes[step] <= target, members, about
+
+        coarse = 2 * largest or 1.0  # all coefficients are 0
+        fits, *best = attempt(coarse)
+        if not fits:
+            raise InputError(
+                f"{target} bytes are too few: tables and description alone take {sizes[coarse]}. Ask for a smaller ratio."
+            )
+        finest = max(largest / _LARGEST, np.finfo(np.float32).tiny)
+        fine = coarse
+        while fits and fine > finest:  # coarse steps are quick
+            coarse, fine = fine, max(fine / 4, finest)
+            fits, *found = attempt(fine)
+            best = found if fits else best
+        for trial in range(_MOST_TRIALS):
+            if fits or sizes[coarse] >= (1 - _CLOSE) * target:
+                break
+            # sizes are near a power of the step
+            span = math.log(sizes[fine] / sizes[coarse])
+            place = math.log(sizes[fine] / ((1 - _CLOSE / 2) * target)) / span
+            place = min(max(place, 0.05), 0.95) if trial % 3 < 2 else 0.5
+            step = math.exp(math.log(fine) + place * math.log(coarse / fine))
+            fewer, *found = attempt(step)
+            if fewer:
+                coarse, best = step, found
+            else:
+                fine = step
+        return CodedModel(best[0], self.source, best[1])
+
+
+def _quantise(values, step):
+    sizes = np.abs(values)
+    sizes *= 1 / step
+    sizes += _ROUND
+    return np.copysign(np.floor(sizes, out=sizes), values).astype(np.int32)
+
+
+def _live(planes, axis, least=1):
+    """How far along an axis there are at least so many numbers other than 0."""
+    others = tuple(a for a in range(planes.ndim) if a != axis)
+    found = np.flatnonzero(np.count_nonzero(planes, axis=others) >= least)
+    return int(found[-1]) + 1 if len(found) else 0
+
+
+def _file_bytes(members, source, about):
+    """Size of the file that a Model of these members is saved to."""
+    file = io.BytesIO()
+    writer = store.Writer(file)
+    for name, array in members.items():
+        writer.array(name, array)
+    for name in tables(source):
+        writer.array(name, getattr(source, name))
+    writer.about(about)
+    writer.close()
+    return len(file.getvalue())
+
+
+def _unpack(members, source, about):
+    """Texture factors (rows, cols, n) and the three angular factors (pairs, n_k), float32, of coded members."""
+    from scipy.fft import idctn
+
+    n, *terms = about["terms"]
+    singular = np.asarray(members["singular_values"], np.float32)
+    texture = decode_planes(members["texture_code"], (n, *source.shape))
+    texture = texture.astype(np.float32)
+    texture *= (np.float32(about["step"]) / singular)[:, None, None]
+    texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
+    if "view_basis" in members:
+        view, light = (
+            np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light")
+        )
+        if len(view) * len(light) != source.n_pairs:
+            raise InputError(
+                f"{source.n_pairs} pairs; expected {len(view)} views times {len(light)} lights."
+            )
+        shape = (view.shape[1], light.shape[1])
+    else:
+        shape = (1, source.n_pairs)
+    planes = decode_planes(members["angular_code"], (sum(terms), *shape))
+    planes = planes.astype(np.float32)
+    planes *= np.float32(about["step"])
+    if "view_basis" in members:
+        with single_threaded_blas():
+            planes = view @ planes @ light.T
+    planes = planes.reshape(len(planes), -1)
+    parts = np.split(planes, np.cumsum(terms)[:-1])
+    return np.ascontiguousarray(texture.transpose(1, 2, 0)), [
+        np.ascontiguousarray(part.T) for part in parts
+    ]
