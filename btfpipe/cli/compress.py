@@ -109,9 +109,17 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
             f" {', '.join(DATABASES)}."
         )
     opened = [Sample.open(path) for path in samples]
+    names = _names(samples) if len(samples) > 1 else None
     with naming(samples[0]), progress("compress: pictures read", quiet) as report:
         model = compress_samples(
-            opened, method, seed=seed, threads=threads, memory=memory, on_progress=report, **options
+            opened,
+            method,
+            names=names,
+            seed=seed,
+            threads=threads,
+            memory=memory,
+            on_progress=report,
+            **options,
         )
     model.about.setdefault("n_terms", getattr(model, "n_terms", None))
     raw = sum(raw_bytes(sample) for sample in opened)
@@ -136,6 +144,16 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
         "ratio": raw / size,
         "warnings": warnings,
     }
+
+
+def _names(samples):
+    """Names of a database's materials: those of the files, as far as the first dot."""
+    names = [path.name.partition(".")[0] for path in samples]
+    if len(set(names)) < len(names):
+        raise click.UsageError(
+            f"the materials of a database take the names of their files, and {names} are not all different."
+        )
+    return names
 
 
 def _flag(name):

@@ -1,5 +1,6 @@
 """Models: compressed Samples, one module a method, all `Appearance`s."""
 
+import functools
 import importlib
 from collections import namedtuple
 
@@ -76,7 +77,9 @@ def open_appearance(path):
     return getattr(importlib.import_module(method.module), method.model).from_reader(reader)
 
 
-def compress(samples, method, *, seed=0, threads=1, memory=2 << 30, on_progress=None, **options):
+def compress(
+    samples, method, *, names=None, seed=0, threads=1, memory=2 << 30, on_progress=None, **options
+):
     """Make a Model of one Sample or, for a database, of several.
 
     Parameters
@@ -85,6 +88,8 @@ def compress(samples, method, *, seed=0, threads=1, memory=2 << 30, on_progress=
         One, except for a method in `DATABASES`.
     method : str
         A key of `METHODS` that has a function.
+    names : list of str, optional
+        Of the materials of a database.
     seed, threads, memory, on_progress
         See the method's function.
     **options
@@ -103,7 +108,9 @@ def compress(samples, method, *, seed=0, threads=1, memory=2 << 30, on_progress=
         method = "factored"  # channel by channel, in a colour space
     chosen = METHODS[method]
     function = getattr(importlib.import_module(chosen.module), chosen.function)
-    if method not in DATABASES:
+    if method in DATABASES:
+        function = functools.partial(function, names=names)
+    else:
         (samples,) = samples
     return function(
         samples,

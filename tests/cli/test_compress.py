@@ -9,6 +9,8 @@ from btfpipe.compression import open_appearance
 from btfpipe.compression.svd import SvdModel, compress_svd
 from btfpipe.sample import Sample
 
+SVD = ("--method", "svd")
+
 
 @pytest.fixture
 def sample_file(make_sample, tmp_path):
@@ -19,7 +21,7 @@ def sample_file(make_sample, tmp_path):
 
 def test_the_summary_states_error_bytes_and_ratio(btfpipe, sample_file, tmp_path):
     out = tmp_path / "m.model.npz"
-    done = btfpipe("compress", sample_file, "-o", out, "--components", 8, "--json")
+    done = btfpipe("compress", sample_file, "-o", out, *SVD, "--components", 8, "--json")
     facts = json.loads(done.stdout)
     assert facts["bytes"] == out.stat().st_size
     assert facts["sample_bytes"] == 3 * 16 * 20 * 133
@@ -38,7 +40,9 @@ def test_precision_decides_the_bytes(btfpipe, sample_file, tmp_path):
     sizes = {}
     for precision in ("half", "single"):
         out = tmp_path / f"{precision}.npz"
-        btfpipe("compress", sample_file, "-o", out, "--precision", precision, "--components", 8)
+        btfpipe(
+            "compress", sample_file, "-o", out, *SVD, "--precision", precision, "--components", 8
+        )
         sizes[precision] = out.stat().st_size
     assert sizes["single"] - sizes["half"] == pytest.approx(2 * 8 * (16 * 20 + 3 * 133), abs=128)
 
@@ -53,6 +57,7 @@ def test_same_bytes_for_any_threads_and_other_bytes_for_another_seed(
             sample_file,
             "-o",
             tmp_path / name,
+            *SVD,
             "--components",
             8,
             "--iterations",
@@ -68,7 +73,7 @@ def test_a_rank_below_the_components_is_a_warning(btfpipe, make_sample, tmp_path
     sample.codes[:] = sample.codes[:1]
     sample.save(tmp_path / "s.npz")
     done = btfpipe(
-        "compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "--components", 5, "--json"
+        "compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", *SVD, "--components", 5, "--json"
     )
     facts = json.loads(done.stdout)
     assert facts["n_terms"] == 3
@@ -79,7 +84,7 @@ def test_one_picture_of_one_view_and_light_compresses(btfpipe, make_sample, tmp_
     from btfpipe.directions import bonn81
 
     make_sample(lights=bonn81()[:1], views=bonn81()[:1]).save(tmp_path / "s.npz")
-    done = btfpipe("compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "--json")
+    done = btfpipe("compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", *SVD, "--json")
     facts = json.loads(done.stdout)
     assert facts["relative_error"] < 1e-3
     assert facts["n_terms"] == 3
@@ -120,7 +125,10 @@ def test_what_is_no_sample_is_refused_and_nothing_is_written(btfpipe, make_sampl
     [
         (("--components", 0), 2, "0 is not in the range"),
         (("--method", "magic"), 2, "magic"),
-        (("--memory", "10K"), 3, "s.sample.npz: 50 vectors"),
+        ((*SVD, "--memory", "10K"), 3, "s.sample.npz: 50 vectors"),
+        (("--method", "view-pca", "--clusters", 3), 2, "view-pca has no --clusters"),
+        (("--ratio", 50, "--target-bytes", "9K"), 2, "two ways to say the same"),
+        (("--method", "harmonics", "--view-harmonics", 7), 3, "square number"),
         (("--memory", "9" * 400), 2, "more memory than any machine has"),
     ],
 )
@@ -130,9 +138,58 @@ def test_impossible_options_are_refused(btfpipe, sample_file, tmp_path, options,
     assert not list(tmp_path.glob("m.npz*"))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--ratio", 8),
+        ("--method", "svd", "--space", "log", "--channel-components", 9, 4, 4),
+        ("--method", "view-pca", "--components", 4, "--precision", "byte"),
+        ("--method", "local-pca", "--clusters", 3, "--components", 5),
+        ("--method", "harmonics", "--view-harmonics", 4, "--light-harmonics", 9),
+    ],
+)
+def test_every_method_makes_a_model_whose_summary_is_true(btfpipe, sample_file, tmp_path, options):
+    out = tmp_path / "m.npz"
+    facts = json.loads(btfpipe("compress", sample_file, "-o", out, *options, "--json").stdout)
+    model, sample = open_appearance(out), Sample.open(sample_file)
+    values = sample.pictures(slice(None))
+    error = np.sqrt(np.mean(np.square(model.pictures(slice(None)) - values, dtype=np.float64)))
+    assert facts["rmse"] == pytest.approx(error, rel=1e-3)
+    assert facts["relative_error"] == pytest.approx(
+        error / np.sqrt(np.mean(np.square(values, dtype=np.float64))), rel=1e-3
+    )
+    assert facts["bytes"] == out.stat().st_size
+    value = model.evaluate(3.0, 4.0, [0, 0, 1], [0, 0, 1])
+    assert np.isfinite(value).all()
+    if "--ratio" in options:
+        assert facts["ratio"] >= 8
+
+
+def test_several_samples_make_a_database(btfpipe, make_sample, tmp_path):
+    for name, seed in (("wool", 1), ("felt", 2)):
+        make_sample(seed=seed).save(tmp_path / f"{name}.npz")
+    files = tmp_path / "wool.npz", tmp_path / "felt.npz"
+    out = tmp_path / "m.npz"
+    done = btfpipe(
+        "compress", *files, "-o", out, "--method", "local-pca", "--clusters", 8, "--components", 9, "--json"
+    )  # fmt: skip
+    facts = json.loads(done.stdout)
+    assert (
+        facts["sample_bytes"] == 2 * 6 * 16 * 20 * 133
+        or facts["sample_bytes"] == 2 * 3 * 16 * 20 * 133
+    )
+    model = open_appearance(out)
+    assert list(model.materials) == ["wool", "felt"]
+    for number, path in enumerate(files):
+        values = Sample.open(path).pictures(slice(None))
+        error = model.material(number).pictures(slice(None)) - values
+        assert np.sqrt((error**2).mean()) < 0.1 * values.std()
+
+
 def test_several_samples_are_refused_by_a_method_that_takes_one(btfpipe, sample_file, tmp_path):
     done = btfpipe("compress", sample_file, sample_file, "-o", tmp_path / "m.npz", code=2)
-    assert "takes one sample; 2 are given" in done.stderr
+    assert "method coded takes one sample; 2 are given" in done.stderr
 
 
 def test_an_existing_model_is_kept_without_force(btfpipe, sample_file, tmp_path):

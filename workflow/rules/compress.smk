@@ -14,12 +14,15 @@ rule compress:
     resources:
         mem_mb=3000,
     params:
-        components=lookup("compress/components", within=config),
+        options=" ".join(
+            option(f"--{key}", config["compress"].get(key))
+            for key in ("method", "ratio", "components")
+        ),
         seed=lookup("seed", within=config),
         code=code("compression", "cli/compress.py"),
     message:
-        "compressing {wildcards.sample} to {params.components} terms"
+        "compressing {wildcards.sample}"
     shell:
-        "btfpipe compress {input.sample:q} --method svd --components {params.components}"
+        "btfpipe compress {input.sample:q} {params.options}"
         " --seed {params.seed} --threads {threads}"
         " --out {output.model:q} --json > {output.summary:q} 2> {log:q}"
