@@ -297,3 +297,31 @@ def test_same_seed_gives_the_same_bytes_for_any_number_of_threads(
     assert pictures[0] == pictures[1]
     assert b"1980:01:01" in pictures[0]  # the date of all pictures: no clock in the bytes
     assert pictures[0] != pictures[2]
+
+
+def test_an_object_names_its_material_of_a_database(make_sample, tmp_path):
+    from btfpipe.compression.local_pca import compress_local_pca
+    from btfpipe.rendering.renderer import render
+
+    samples = [make_sample(16, 16, seed=seed, toroidal=True) for seed in (1, 2)]
+    compress_local_pca(samples, clusters=6, components=8, names=["wool", "felt"]).save(
+        tmp_path / "cloth.npz"
+    )
+    for name, sample in zip(("wool", "felt"), samples, strict=True):
+        sample.save(tmp_path / f"{name}.npz")
+
+    def picture(model):
+        (tmp_path / "s.yaml").write_text(
+            "camera: {type: orthographic, position: [0, 0, 3], target: [0, 0, 0], height: 2}\n"
+            "lights: [{type: directional, direction: [0, 0, 1], irradiance: [3, 3, 3]}]\n"
+            "objects: [{plane: {center: [0, 0, 0], s: [1, 0, 0], t: [0, 1, 0], size: [2, 2]}, "
+            f"model: {model}}}]\n"
+        )
+        scene = load_scene(tmp_path / "s.yaml", film={"width": 16, "height": 16, "samples": 1})
+        return render(scene)[..., :3]
+
+    for name in ("wool", "felt"):
+        own, other = picture(f"cloth.npz, material: {name}"), picture(f"{name}.npz")
+        assert np.abs(own - other).mean() < 0.1 * other.std()
+    with pytest.raises(InputError, match=r"material 'silk' is not in .*wool, felt"):
+        picture("cloth.npz, material: silk")
