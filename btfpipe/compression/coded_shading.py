@@ -3,32 +3,23 @@
 import numpy as np
 
 from btfpipe.compiled import leaf
-from btfpipe.sample.shading import PairWeights, corners
+from btfpipe.sample.shading import PairShader, corners
 
 
-class CodedShader:
+class CodedShader(PairShader):
     """Evaluates a `CodedModel` between its texels, lights and views.
 
-    Roots are not linear in the values: every value that is blended (9 pairs barycentrically, 16 of the four nearest,
-    1 of the nearest; 4 texels) is made first.
+    Roots are not linear in the values: every value that is blended (1, 4, 9 or 16 pairs; 4 texels) is made first.
 
     Parameters
     ----------
     model : CodedModel
-        Of a product of views and lights.
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
-
-    Raises
-    ------
-    InputError
-        If the Model's pairs are not a product.
+        See `PairWeights`.
     """
 
     def __init__(self, model, interpolation="barycentric"):
-        self.pairs = PairWeights(model, interpolation)
-        self.rows, self.cols = model.shape
-        self.toroidal = model.toroidal
+        super().__init__(model, interpolation)
         self.texture = model.texture_factors.reshape(-1, model.n_terms)
         self.angular = model.angular_factors
         self.colour = model.colour

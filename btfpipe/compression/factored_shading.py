@@ -4,12 +4,12 @@ import numpy as np
 from numba import njit
 
 from btfpipe.compression.factored import SPACES, decode_colour
-from btfpipe.sample.shading import PairWeights, corners
+from btfpipe.sample.shading import PairShader, corners
 
 _FLAGS = {"contract", "reassoc", "nsz"}  # sums in any order, so that they run in vectors
 
 
-class FactoredShader:
+class FactoredShader(PairShader):
     """Evaluates a `FactoredModel` between its texels, lights and views.
 
     Holds both factors in single precision, the three channels of a texel or pair side by side.
@@ -17,20 +17,12 @@ class FactoredShader:
     Parameters
     ----------
     model : FactoredModel
-        Of a product of views and lights.
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
-
-    Raises
-    ------
-    InputError
-        If the Model's pairs are not a product.
+        See `PairWeights`.
     """
 
     def __init__(self, model, interpolation="barycentric"):
-        self.pairs = PairWeights(model, interpolation)
-        self.rows, self.cols = model.shape
-        self.toroidal = model.toroidal
+        super().__init__(model, interpolation)
         self.ends = np.cumsum([0, *model.n_terms])
         self.texture = _joined(
             [f.reshape(self.rows * self.cols, f.shape[2]) for f in model.texture_factors]

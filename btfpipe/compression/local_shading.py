@@ -3,10 +3,10 @@
 import numpy as np
 from numba import njit
 
-from btfpipe.sample.shading import PairWeights, corners
+from btfpipe.sample.shading import PairShader, corners
 
 
-class LocalPcaShader:
+class LocalPcaShader(PairShader):
     """Evaluates a `LocalPcaModel` between its texels, lights and views.
 
     Coordinates are blended only among those of the four texels that share a cluster; the values of different clusters
@@ -15,20 +15,12 @@ class LocalPcaShader:
     Parameters
     ----------
     model : LocalPcaModel
-        Of a product of views and lights.
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
-
-    Raises
-    ------
-    InputError
-        If the Model's pairs are not a product.
+        See `PairWeights`.
     """
 
     def __init__(self, model, interpolation="barycentric"):
-        self.pairs = PairWeights(model, interpolation)
-        self.rows, self.cols = model.shape
-        self.toroidal = model.toroidal
+        super().__init__(model, interpolation)
         self.coordinates, self.labels = model.own_texels()
         self.bases = model.bases_of(slice(None)).reshape(model.n_clusters, model.n_pairs, -1)
 

@@ -3,10 +3,10 @@
 import numpy as np
 from numba import njit
 
-from btfpipe.sample.shading import PairWeights, corners
+from btfpipe.sample.shading import PairShader, corners
 
 
-class SvdShader:
+class SvdShader(PairShader):
     """Evaluates an `SvdModel` between its texels, lights and views.
 
     The factors are linear in the values, so blending them (1, 4, 9 or 16 pairs; 4 texels) is blending the pictures.
@@ -19,9 +19,7 @@ class SvdShader:
     """
 
     def __init__(self, model, interpolation="barycentric"):
-        self.pairs = PairWeights(model, interpolation)
-        self.rows, self.cols = model.shape
-        self.toroidal = model.toroidal
+        super().__init__(model, interpolation)
         n = model.n_terms
         self.texture = np.ascontiguousarray(model.texture_factors, np.float32).reshape(-1, n)
         self.angular = np.ascontiguousarray(model.angular_factors, np.float32).reshape(-1, 3 * n)

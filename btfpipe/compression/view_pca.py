@@ -14,7 +14,7 @@ from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
-from btfpipe.sample.shading import PairWeights, corners
+from btfpipe.sample.shading import PairShader, corners
 
 _COLUMNS = (
     8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
@@ -252,7 +252,7 @@ def _view_terms(values, terms):
     return textures, weights * scale, rank
 
 
-class ViewPcaShader:
+class ViewPcaShader(PairShader):
     """Evaluates a `ViewPcaModel` between its texels, lights and views.
 
     Weights are linear in the values: those of the lights around a direction are blended within each view, then the
@@ -262,13 +262,11 @@ class ViewPcaShader:
     ----------
     model : ViewPcaModel
     interpolation : str
-        ``barycentric``, ``four`` or ``nearest``.
+        See `PairWeights`.
     """
 
     def __init__(self, model, interpolation="barycentric"):
-        self.pairs = PairWeights(model, interpolation)
-        self.rows, self.cols = model.shape
-        self.toroidal = model.toroidal
+        super().__init__(model, interpolation)
         views, terms = len(model.means), 1 + model.n_terms
         # the terms of a texel and view lie together; single precision, as the processor computes in no other
         self.textures = np.empty((self.rows * self.cols, views, 3 * terms), np.float32)
@@ -279,17 +277,18 @@ class ViewPcaShader:
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
+        # pairs of one view follow each other, or, the nearest in light-view space, stand alone
+        near = 1 if self.pairs.near is not None else int(np.sqrt(self.pairs.most))
         for part, pair, share in self.pairs.blocks(w_i, w_o):
             _shade(
-                self.textures, self.weights, self.lights, self.rows, self.cols, self.toroidal,
+                self.textures, self.weights, self.lights, near, self.rows, self.cols, self.toroidal,
                 row[part], col[part], pair, share, out[part],
             )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _shade(textures, weights, lights, rows, cols, toroidal, row, col, pair, share, out):
+def _shade(textures, weights, lights, near, rows, cols, toroidal, row, col, pair, share, out):
     terms = weights.shape[1]
-    one = int(np.sqrt(pair.shape[1]))  # lights around a light, views around a view
     texel = np.zeros(4, np.int64)
     bilinear = np.zeros(4, np.float32)
     blended = np.zeros(terms, np.float32)
@@ -299,10 +298,9 @@ def _shade(textures, weights, lights, rows, cols, toroidal, row, col, pair, shar
         red = np.float32(0)
         green = np.float32(0)
         blue = np.float32(0)
-        for o in range(one):
-            first = o * one
+        for first in range(0, pair.shape[1], near):
             blended[:] = 0.0
-            for i in range(first, first + one):
+            for i in range(first, first + near):
                 weight = weights[pair[q, i]]
                 w = share[q, i]
                 for k in range(terms):

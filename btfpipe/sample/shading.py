@@ -18,7 +18,23 @@ _QUERIES = 8192  # whose pairs are listed at a time
 _BLOCK = 64  # texels whose pairs are gathered together: a line of the cache is then read once
 
 
-class RawShader:
+class PairShader:
+    """What shaders that blend measured pairs share.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    interpolation : str
+        See `PairWeights`.
+    """
+
+    def __init__(self, appearance, interpolation="barycentric"):
+        self.pairs = PairWeights(appearance, interpolation)
+        self.rows, self.cols = appearance.shape
+        self.toroidal = bool(appearance.toroidal)
+
+
+class RawShader(PairShader):
     """Evaluates a Sample between its texels, lights and views.
 
     Holds the codes in texel-major order ``(texel, view, light, channel)``, so that the pictures blended at one
@@ -37,9 +53,7 @@ class RawShader:
     """
 
     def __init__(self, sample, interpolation="barycentric"):
-        self.pairs = PairWeights(sample, interpolation)
-        self.rows, self.cols = sample.shape
-        self.toroidal = sample.toroidal
+        super().__init__(sample, interpolation)
         self.codes = texel_major(sample)
         self.table = _table(sample)
         self.gain = np.zeros((0, 3), np.float32)

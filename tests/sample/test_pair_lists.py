@@ -87,3 +87,32 @@ def test_a_list_of_pairs_is_compressed_synthesised_and_rendered(make_sample, tmp
     values = model.pictures(slice(None))
     assert picture[..., :3].min() > 0.2 * values.mean()
     assert picture[..., :3].std() > 0
+
+
+@pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest", "reciprocal"])
+def test_models_of_every_method_are_interpolated_as_their_pictures_are(make_sample, interpolation):
+    """A Sample made of a Model's own pictures is evaluated like the Model."""
+    from btfpipe.compression import METHODS, compress
+
+    few = {
+        "svd": {"components": 6},
+        "view-pca": {"components": 2},
+        "local-pca": {"clusters": 3, "components": 4},
+        "factored": {"channel_components": (5, 3, 3)},
+        "coded": {"ratio": 4.0},
+    }
+    assert set(few) == {n for n, m in METHODS.items() if m.function} - {"harmonics"}
+    sample = make_sample(10, 12)
+    w_i, w_o = queries(200)
+    rng = np.random.default_rng(4)
+    row, col = rng.random(200) * 9, rng.random(200) * 11
+    for method, options in few.items():
+        model = compress([sample], method, **options)
+        pictures = Sample(
+            model.pictures(slice(None)), sample.light_directions, sample.view_directions,
+            sample.light_index, sample.view_index,
+        )  # fmt: skip
+        a, b = (
+            m.evaluate(row, col, w_i, w_o, interpolation=interpolation) for m in (model, pictures)
+        )
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4, err_msg=method)
