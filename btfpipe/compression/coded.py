@@ -178,7 +178,7 @@ def compress_coded(
     lengths = sample.shape[0] * sample.shape[1] + 3 * sample.n_pairs
     if n_terms is None:
         plain = target_bytes // (2 * lengths)
-        n_terms = max(_TERMS, plain, min(3 * plain, 2 * _TERMS))
+        n_terms = max(_TERMS, plain, min(12 * plain, 2 * _TERMS))
     most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
     # factors, transformed, quantised, with what that takes, and unpacked again
     need = (104 << 20) + 4 * 7 * most * lengths
