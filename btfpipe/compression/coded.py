@@ -145,7 +145,7 @@ def compress_coded(
         unless all that `n_terms` can give fits.
     n_terms : int, optional
         Terms made at most; those of no use at this size are left out. Fewer shade faster, more help at low ratios. By
-        default 256, three times those of a plain SVD of the same size up to 512, and never fewer than it has.
+        default 256, twelve times those of a plain SVD of the same size up to 512, and never fewer than it has.
     seed : int
         Of the random start.
     threads : int
