@@ -29,7 +29,7 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
 @click.option(
     "--ratio",
     type=FiniteFloat(min=1),
-    help="Bytes of the pictures over those of the file, for coded.  [default: 100]",
+    help="Bytes of the pictures over those of the file, for coded.  [default: 100, less for samples under some MB]",
 )
 @click.option(
     "--space",
@@ -93,15 +93,17 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
 
     if options["space"] is not None:
         options["space"] = _SPACES[options["space"]]
-    takes = METHODS[method].options
+    apart = options["space"] is not None or options["channel_components"] is not None
+    takes = METHODS["factored" if method == "svd" and apart else method].options
     if options["ratio"] is not None and options["target_bytes"] is not None:
         raise click.UsageError("--ratio and --target-bytes are two ways to say the same; give one.")
-    if method == "svd":
-        takes = takes | {"space": None, "channel_components": None}
+    if options["precision"] == "byte" and method not in ("view-pca", "local-pca"):
+        raise click.UsageError(f"method {method} has no --precision byte; expected half or single.")
     for name, value in options.items():
         if value is not None and name not in takes:
+            how = " channel by channel" if method == "svd" and apart else ""
             raise click.UsageError(
-                f"method {method} has no {_flag(name)}; it takes {', '.join(map(_flag, takes))}."
+                f"method {method}{how} has no {_flag(name)}; it takes {', '.join(map(_flag, takes))}."
             )
     if len(samples) > 1 and method not in DATABASES:
         raise click.UsageError(

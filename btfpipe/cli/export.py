@@ -34,7 +34,9 @@ _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
     help="Terms of luminance and of each chroma of a .btf; a Model of method factored keeps its own.  [default: 32 16 16]",
 )
 @stage(folder=True)
-def export(source, format_, suffix, sample_number, channel_components, out, threads, quiet):
+def export(
+    source, format_, suffix, sample_number, channel_components, out, seed, threads, memory, quiet
+):
     """Write SOURCE, a Sample or a Model, in a format that other programs read.
 
     Sets of pictures become a zip if the name ends in .zip, else a folder: ubo (Bonn's layout), utia, pairs (any pairs, with a CSV
@@ -59,6 +61,8 @@ def export(source, format_, suffix, sample_number, channel_components, out, thre
     for name in options:
         if name not in targets.WRITERS[format_].options:
             raise click.UsageError(f"--{name.replace('_', '-')} is not for {format_}.")
+    if format_ == "btf":  # factorised on the way
+        options |= {"seed": seed, "memory": memory}
     appearance = open_appearance(source)
     with naming(source), progress("export: pictures", quiet) as report:
         facts = targets.write(

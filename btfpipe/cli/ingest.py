@@ -153,7 +153,11 @@ def ingest(source, format_, out, threads, quiet, **options):
     told = {"inputs": [source], "taken_for": name, "because": reason}
     opened = sources.open_source(source, name, **own)
     if isinstance(opened, Model):
-        given = [key for key, value in options.items() if value not in (None, False)]
+        given = [
+            key
+            for key, value in options.items()
+            if value not in (None, False) or (key == "toroidal" and value is False)
+        ]
         if given:
             raise click.UsageError(
                 f"{source} is compressed already and is kept as it is; {_flag(given[0])} is for pictures."
@@ -167,7 +171,7 @@ def ingest(source, format_, out, threads, quiet, **options):
         )
     if not quiet:
         for warning in facts.get("warnings", []):
-            click.echo(f"Warning: {warning}.", err=True)
+            click.echo(f"Warning: {warning.rstrip('.')}.", err=True)
     return told | facts
 
 

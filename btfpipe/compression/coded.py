@@ -203,7 +203,7 @@ def compress_coded(
     with single_threaded_blas():
         packer = _Packer(factors)
         del factors
-        model = packer.fit(target_bytes - spare, threads)
+        model = packer.fit(target_bytes, spare, threads)
     model.about |= measured_error(
         model,
         sample,
@@ -278,11 +278,11 @@ class _Packer:
         if factors.is_product:
             angular = angular.reshape(3, n, len(factors.view_directions), -1)
             for name, axis in (("view_basis", 2), ("light_basis", 3)):
-                basis = _principal_axes(angular, axis)
-                self.tables[name] = basis.astype(np.float16)
-                angular = np.moveaxis(
-                    np.moveaxis(angular, axis, -1) @ basis.astype(np.float32), -1, axis
-                )
+                stored = _principal_axes(angular, axis).astype(np.float16)
+                self.tables[name] = stored
+                # of the axes as stored, which rounding has left not quite orthogonal
+                onto = np.linalg.inv(stored.astype(np.float64)).T.astype(np.float32)
+                angular = np.moveaxis(np.moveaxis(angular, axis, -1) @ onto, -1, axis)
         else:
             angular = angular[:, :, None]
         self.angular = np.ascontiguousarray(angular)
@@ -311,21 +311,22 @@ class _Packer:
         members["texture_code"], members["angular_code"] = ordered_map(encode_planes, jobs, threads)
         return members, {"shape": list(self.source.shape), "step": step, "terms": terms}
 
-    def fit(self, target, threads=1):
-        """The Model whose file is as large as `target` allows."""
+    def fit(self, target, spare=0, threads=1):
+        """The Model whose file is as large as `target` allows, with some bytes to spare."""
         largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
         sizes = {}
 
         def attempt(step):
             members, about = self.pack(step, threads)
-            sizes[step] = _file_bytes(members, self.source, about)
+            sizes[step] = _file_bytes(members, self.source, about) + spare
             return sizes[step] <= target, members, about
 
         coarse = 2 * largest or 1.0  # all coefficients are 0
         fits, *best = attempt(coarse)
         if not fits:
             raise InputError(
-                f"{target} bytes are too few: tables and description alone take {sizes[coarse]}. Ask for a smaller ratio."
+                f"{target} bytes are too few: tables and description alone take {sizes[coarse]}. Ask for a smaller"
+                " --ratio, or for more --target-bytes."
             )
         finest = max(largest / _LARGEST, np.finfo(np.float32).tiny)
         fine = coarse

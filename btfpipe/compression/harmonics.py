@@ -48,19 +48,19 @@ class HarmonicsModel(Model):
 
     def __init__(self, codes, minimum, maximum, source, about=None):
         super().__init__(codes.shape[:2], source, about)
-        self.codes = codes
+        self.coefficient_codes = codes  # not `codes`, which are a Sample's pictures
         self.minimum, self.maximum = minimum, maximum
 
     @property
     def view_terms(self):
-        return self.codes.shape[3]
+        return self.coefficient_codes.shape[3]
 
     @property
     def light_terms(self):
-        return self.codes.shape[4]
+        return self.coefficient_codes.shape[4]
 
     def arrays(self):
-        return {"codes": self.codes, "minimum": self.minimum, "maximum": self.maximum}
+        return {"codes": self.coefficient_codes, "minimum": self.minimum, "maximum": self.maximum}
 
     @classmethod
     def from_arrays(cls, reader, source):
@@ -82,7 +82,7 @@ class HarmonicsModel(Model):
 
     def coefficients(self, rows, cols):
         """Coefficients (n, 3, view terms, light terms) float32 of some texels (two index arrays, or slices)."""
-        return np.asarray(self.codes[rows, cols]) * self.step() + self.minimum
+        return np.asarray(self.coefficient_codes[rows, cols]) * self.step() + self.minimum
 
     def pictures(self, pairs):
         lights = self.light_directions[np.asarray(self.light_index[pairs])]
@@ -91,7 +91,9 @@ class HarmonicsModel(Model):
         seen, place = np.unique(view, return_inverse=True)
         views = spherical_harmonics(self.view_directions[seen], self.view_terms)
         texels = self.shape[0] * self.shape[1]
-        codes = np.asarray(self.codes).reshape(texels, 3, self.view_terms, self.light_terms)
+        codes = np.asarray(self.coefficient_codes).reshape(
+            texels, 3, self.view_terms, self.light_terms
+        )
         out = np.empty((len(view), texels, 3), np.float32)
         from_view = np.empty((texels, 3, self.light_terms), np.float32)
         for k, weights in enumerate(views):

@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe.compiled import leaf
+from btfpipe.directions.pairs import lifted
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,
     highest_degree,
@@ -28,7 +29,7 @@ class HarmonicsShader:
         self.view_table = recursion_table(highest_degree(model.view_terms))
         self.light_table = recursion_table(highest_degree(model.light_terms))
         all_terms = model.view_terms * model.light_terms
-        self.codes = np.asarray(model.codes).reshape(-1, 3, all_terms)
+        self.codes = np.asarray(model.coefficient_codes).reshape(-1, 3, all_terms)
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
 
@@ -36,7 +37,7 @@ class HarmonicsShader:
         """Fill `out`; see `Appearance.shader`."""
         _shade(
             self.codes, self.minimum, self.step, self.view_table, self.light_table,
-            self.rows, self.cols, self.toroidal, row, col, w_i, w_o, out,
+            self.rows, self.cols, self.toroidal, row, col, w_i, lifted(w_o), out,
         )  # fmt: skip
 
 

@@ -53,7 +53,7 @@ class NearestPairs:
 
         Weights add up to 1. Directions below the surface are taken at the horizon.
         """
-        queries = np.concatenate([_lifted(w_i), _lifted(w_o)], axis=1)
+        queries = np.concatenate([lifted(w_i), lifted(w_o)], axis=1, dtype=np.float64)
         distance, index = self._tree.query(queries, k=range(1, self.count + 1 + (not self._all)))
         radius = np.full((len(queries), 1), 2 * np.sqrt(2)) if self._all else distance[:, -1:]
         distance, index = distance[:, : self.count], index[:, : self.count]
@@ -70,12 +70,12 @@ class NearestPairs:
         weight[:, self.count :] = 0
 
 
-def _lifted(directions):
-    """Directions as float64, those below the surface turned up to the horizon."""
-    lifted = np.array(directions, np.float64)
-    below = lifted[:, 2] < 0
-    if below.any():
-        flat = lifted[below]
-        flat[:, 2] = 0
-        lifted[below] = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-    return lifted
+def lifted(directions):
+    """Directions (n, 3), those below the surface turned up to the horizon."""
+    below = directions[:, 2] < 0
+    if not below.any():
+        return directions
+    out = np.array(directions)
+    out[below, 2] = 0
+    out[below] /= np.maximum(np.linalg.norm(out[below], axis=1, keepdims=True), 1e-30)
+    return out

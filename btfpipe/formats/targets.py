@@ -31,7 +31,7 @@ def write(path, name, appearance, *, threads=1, on_progress=None, **options):
     """
     writer = WRITERS[name]
     function = getattr(importlib.import_module(writer.module), writer.function)
-    options = {writer.options[key]: value for key, value in options.items()}
+    options = {writer.options.get(key, key): value for key, value in options.items()}
     facts = function(path, appearance, threads=threads, on_progress=on_progress, **options)
     if isinstance(facts, dict):
         return facts

@@ -17,7 +17,14 @@ from numba import njit
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.harmonics import HarmonicsModel
-from btfpipe.compression.harmonics_shading import FAST, HarmonicsShader, contract, multiply, weigh
+from btfpipe.compression.harmonics_shading import (
+    FAST,
+    HarmonicsShader,
+    contract,
+    multiply,
+    weigh,
+)
+from btfpipe.directions.pairs import lifted
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,
     hemisphere_products,
@@ -37,7 +44,12 @@ _ASIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def project_environment(environment, terms):
     """Coefficients (terms, 3) of an `Environment`'s radiance, in the scene's axes."""
-    highest_degree(terms)
+    rows = environment.values.shape[0]
+    if rows < 2 * highest_degree(terms) + 1:
+        raise InputError(
+            f"{environment.name or 'the environment'}: {rows} rows of pixels are too few for {terms} harmonics; ask"
+            f" for fewer terms."
+        )
     directions, solid_angles, radiances = environment.pixels()
     out = np.zeros((terms, 3))
     with single_threaded_blas():
@@ -99,7 +111,8 @@ class HarmonicEnvironment:
         row, col : (n,) float32
             Texel coordinates, as for `Appearance.shader`.
         frames : (n, 3, 3) float32
-            Rows are the sample's axes s, t, n at each point, in world axes; orthonormal, right-handed.
+            Rows are the sample's axes s, t, n at each point, in world axes; orthonormal, left-handed where a surface is
+            seen from behind.
         w_o : (n, 3) float32
             Unit vectors to the eye in those frames.
         out : (n, 3) float32
@@ -108,6 +121,7 @@ class HarmonicEnvironment:
             A factor a point: the share of the environment that no object hides, by any measure.
         """
         shader = self.shader
+        w_o = lifted(w_o)
         if visibility is None:
             visibility = np.ones(len(row), np.float32)
         _shade(
@@ -147,7 +161,16 @@ def _quarter(terms, back):
 
 @leaf
 def _angles(frames, q, p, turns):
-    """Fill cosines and sines ``turns[:, :, p]`` of the turns about n, t, n that make up the rotation into a frame."""
+    """Fill cosines and sines ``turns[:, :, p]`` of the turns about n, t, n that make up the rotation into a frame.
+
+    Returns 1, or -1 for a left-handed frame, whose t axis is taken the other way round.
+    """
+    hand = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        cross = frames[q, 0, i] * frames[q, 1, j] - frames[q, 0, j] * frames[q, 1, i]
+        hand += cross * frames[q, 2, k]
+    hand = 1.0 if hand >= 0.0 else -1.0
     sine = math.sqrt(frames[q, 2, 0] ** 2 + frames[q, 2, 1] ** 2)
     a = 1.0
     b = 0.0
@@ -159,8 +182,9 @@ def _angles(frames, q, p, turns):
     turns[1, 0, p] = frames[q, 2, 2]
     turns[1, 1, p] = sine
     # from the two others, so that a frame hardly tilted keeps the sum of both turns about n
-    turns[0, 0, p] = frames[q, 1, 0] * b + frames[q, 1, 1] * a
+    turns[0, 0, p] = hand * (frames[q, 1, 0] * b + frames[q, 1, 1] * a)
     turns[0, 1, p] = -frames[q, 0, 0] * b - frames[q, 0, 1] * a
+    return hand
 
 
 @leaf(fastmath=FAST)
@@ -223,6 +247,16 @@ def _couple(coupling, coefficients, light):
         l += 1  # noqa: E741
 
 
+@leaf(fastmath=FAST)
+def _mirror(hand, most, light):
+    """Turn the t axis of left-handed frames back: harmonics of an order below 0 change their sign with it."""
+    for l in range(1, most + 1):  # noqa: E741
+        for i in range(l * l, l * (l + 1)):
+            for c in range(3):
+                for p in range(_GROUP):
+                    light[i, c, p] *= hand[p]
+
+
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _shade(
     codes, minimum, step, view_table, environment, quarters, coupling,
@@ -233,6 +267,7 @@ def _shade(
     degrees = coupling.shape[1]
     most = int(math.sqrt(len(coupling)) + 0.5) - 1
     turns = np.empty((3, 2, _GROUP), np.float32)
+    hand = np.empty(_GROUP, np.float32)
     power = np.empty((2, _GROUP), np.float32)
     turned = np.empty((terms, 3, _GROUP), np.float32)
     other = np.empty((terms, 3, _GROUP), np.float32)
@@ -246,7 +281,7 @@ def _shade(
     share = np.zeros(4, np.float32)
     for start in range(0, len(row), _GROUP):
         for p in range(_GROUP):
-            _angles(frames, min(start + p, len(row) - 1), p, turns)
+            hand[p] = _angles(frames, min(start + p, len(row) - 1), p, turns)
         for i in range(terms):
             for c in range(3):
                 turned[i, c, :] = environment[i, c]
@@ -256,6 +291,7 @@ def _shade(
         _put_aside(first, columns, elements, degrees, most, other, turned)
         _turn(turns, 0, degrees, most, power, turned)
         _couple(coupling, turned, lights)
+        _mirror(hand, most, lights)
         for q in range(start, min(start + _GROUP, len(row))):
             corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
             fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)

@@ -201,9 +201,10 @@ def _environment(light, read_picture):
 def _stand_for(environment, number, light, seed):
     """The directional lights of an environment."""
     method = light.get("method", "q2tree")
-    directions, irradiances = environment.lights(
-        light.get("lights", 64), "q2tree" if method == "harmonics" else method, seed
-    )
+    count = light.get("lights", 64)
+    if method == "harmonics":  # for objects of other Models
+        method, count = "q2tree", max(count, 12)
+    directions, irradiances = environment.lights(count, method, seed)
     return [Light(True, *both, number) for both in zip(directions, irradiances, strict=True)]
 
 

@@ -198,3 +198,14 @@ def test_an_existing_model_is_kept_without_force(btfpipe, sample_file, tmp_path)
     done = btfpipe("compress", sample_file, "-o", out, code=2)
     assert "--force" in done.stderr
     assert out.read_text() == "mine"
+
+
+def test_svd_in_a_space_counts_terms_by_channel(btfpipe, sample_file, tmp_path):
+    done = btfpipe(
+        "compress", sample_file, "-o", tmp_path / "m.npz", *SVD, "--space", "log", "--components", 4, code=2
+    )  # fmt: skip
+    assert "svd channel by channel has no --components" in done.stderr
+    done = btfpipe(
+        "compress", sample_file, "-o", tmp_path / "m.npz", *SVD, "--precision", "byte", code=2
+    )
+    assert "no --precision byte" in done.stderr

@@ -223,7 +223,7 @@ def test_textons_take_the_model(model, cloth):
 
 
 def test_a_size_below_the_tables_is_refused_with_what_they_take(cloth):
-    with pytest.raises(InputError, match=r"alone take \d+\. Ask for a smaller ratio"):
+    with pytest.raises(InputError, match=r"alone take \d+\. Ask for a smaller --ratio"):
         compress_coded(cloth, 5000)
 
 

@@ -35,11 +35,11 @@ def write_map(path, function, rows=32):
     write_picture(path, function(towards).astype(np.float32))
 
 
-def picture(folder, method, extra="", more="", film=(8, 8)):
+def picture(folder, method, extra="", more="", film=(8, 8), position="[0, 0, 3]"):
     """Render a plane that faces +z, two units a side, of the white diffuser."""
     path = folder / "scene.yaml"
     path.write_text(
-        "camera: {type: orthographic, position: [0, 0, 3], target: [0, 0, 0], height: 1.8}\n"
+        f"camera: {{type: orthographic, position: {position}, target: [0, 0, 0], height: 1.8}}\n"
         f"lights: [{{type: environment, map: map.exr, visible: false, lights: 3000, method: {method}{extra}}}]\n"
         "objects:\n"
         "- {plane: {center: [0, 0, 0], s: [0.8, 0.6, 0], t: [-0.6, 0.8, 0], size: [3, 3]}, model: white.npz}\n"
@@ -68,6 +68,26 @@ def test_the_frequency_domain_agrees_with_many_lights(white):
     spectral, sampled = (picture(white.parent, method) for method in ("harmonics", "q2tree"))
     assert np.ptp(sampled[4, 4]) > 0.2  # of different colours
     np.testing.assert_allclose(spectral, sampled, rtol=0.02)
+
+
+def test_the_back_of_a_surface_is_lit_as_by_many_lights(white):
+    """Behind, the frame is mirrored; the diffuser is tilted along s, so that the mirror would show."""
+    directions = bonn81()
+    pair = np.arange(81 * 81)
+    tilted = np.maximum(directions @ [0.45, 0.35, 0.82], 0)
+    codes = tilted[pair % 81][:, None, None, None] * np.ones((1, 2, 2, 3))
+    sample = Sample(codes.astype(np.float32), directions, directions, pair % 81, pair // 81)
+    compress_harmonics(sample).save(white)
+    write_map(
+        white.parent / "map.exr",
+        lambda d: 0.1 + np.maximum(d @ [0.6, -0.3, -0.74], 0)[..., None] ** 6 * [4, 2, 1],
+    )
+    back = {"position": "[0, 0, -3]"}
+    spectral, sampled = (
+        picture(white.parent, method, **back) for method in ("harmonics", "q2tree")
+    )
+    assert sampled.mean() > 0.2
+    np.testing.assert_allclose(spectral, sampled, rtol=0.03)
 
 
 def test_a_wall_hides_its_share_of_the_sky(white):

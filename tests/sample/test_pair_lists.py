@@ -116,3 +116,30 @@ def test_models_of_every_method_are_interpolated_as_their_pictures_are(make_samp
             m.evaluate(row, col, w_i, w_o, interpolation=interpolation) for m in (model, pictures)
         )
         np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4, err_msg=method)
+
+
+def test_a_model_of_any_method_is_compressed_again_by_any_other(make_sample):
+    """What is a Model is never taken for a Sample."""
+    from btfpipe.analysis.textons import texton_features
+    from btfpipe.compression import METHODS, compress
+    from btfpipe.metrics import raw_bytes
+
+    few = {
+        "svd": {"components": 9},
+        "view-pca": {"components": 4},
+        "local-pca": {"clusters": 3, "components": 6},
+        "factored": {"channel_components": (9, 6, 6)},
+        "coded": {"ratio": 2.0},
+        "harmonics": {"view_harmonics": 4, "light_harmonics": 9},
+    }
+    assert set(few) == {n for n, m in METHODS.items() if m.function}
+    sample = make_sample(10, 12)
+    for method, options in few.items():
+        model = compress([sample], method, **options)
+        model.about["sample_bytes"] = 12345
+        assert raw_bytes(model) == 12345
+        pictures = model.pictures(slice(None))
+        for again in few:
+            twice = compress([model], again, **few[again]).pictures(slice(None))
+            assert np.abs(twice - pictures).mean() < 0.5 * pictures.std(), (method, again)
+        texton_features(model, levels=1, n_textons=8, n_pictures=8)

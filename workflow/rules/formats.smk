@@ -44,11 +44,13 @@ rule ingest_export:
     resources:
         mem_mb=2000,
     params:
-        code=code("cli/ingest.py"),
+        # a list of pairs comes back as one
+        pairs=lambda wildcards: "--pairs" if wildcards.format in ("ubo", "utia") else "",
+        code=code("compression", "cli/ingest.py"),
     message:
         "reading {wildcards.sample} back from {wildcards.format}"
     shell:
-        "btfpipe ingest {input.file:q}"
+        "btfpipe ingest {input.file:q} {params.pairs}"
         " --threads {threads} --out {output.appearance:q} --json > {output.summary:q} 2> {log:q}"
 
 

@@ -15,7 +15,7 @@ rule ingest:
         mem_mb=1000,
     params:
         options=sample_options,
-        code=code("cli/ingest.py"),
+        code=code("compression", "cli/ingest.py"),
     message:
         "ingesting {wildcards.sample}"
     shell:
@@ -40,7 +40,7 @@ rule ingest_frontal:
         mem_mb=1000,
     params:
         options=sample_options,
-        code=code("cli/ingest.py"),
+        code=code("compression", "cli/ingest.py"),
     message:
         "taking the frontal picture of {wildcards.sample}"
     shell:
@@ -64,7 +64,7 @@ rule ingest_truth:
     resources:
         mem_mb=1000,
     params:
-        code=code("cli/ingest.py"),
+        code=code("compression", "cli/ingest.py"),
     message:
         "ingesting the ground truth of {wildcards.sample}"
     shell:
