@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import pairs, sources, utia
+from btfpipe.formats.describe import describe_foreign
 from btfpipe.formats.images import encode_picture
 from btfpipe.formats.pairs import correction, write_pairs
 from btfpipe.sample import Sample
@@ -277,3 +278,25 @@ def test_lists_are_recognised_and_other_things_are_not(tmp_path, make_sample, ma
     ):
         assert pairs.recognise(path) is None
     assert utia.recognise(tmp_path / "set") is None
+
+
+def test_mislabelled_pictures_are_the_same_however_often_they_are_read(tmp_path):
+    n = 30
+    folder = tmp_path / "set"
+    folder.mkdir()
+    rows = "".join(f"{i:02d}.jpg,{i},0,0,0\n" for i in range(n))
+    (folder / "list.csv").write_text(HEAD + rows)
+    data = encode_picture(np.zeros((4, 4, 3), np.uint8), ".png")
+    for i in range(n):
+        (folder / f"{i:02d}.jpg").write_bytes(data)
+    with pairs.open_measurement(folder) as measurement:
+        for pair in (*range(n)[::-1], *range(n)):
+            measurement.read(pair)
+        facts = ingest(measurement, tmp_path / "s.npz", threads=2)
+    assert facts["n_mislabelled"] == n
+    assert facts["mislabelled"] == [f"{i:02d}.jpg" for i in range(20)]
+    described = describe_foreign(folder, threads=2)
+    assert described["facts"]["mislabelled"] == facts["mislabelled"]
+    (problem,) = described["problems"]
+    assert problem.startswith("30 pictures are mislabelled: 00.jpg, 01.jpg,")
+    json.dumps(described["facts"])
