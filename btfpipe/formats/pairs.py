@@ -60,7 +60,9 @@ def recognise(path):
     if not found:
         return None
     if len(found) > 1:
-        return f"{len(found)} lists of pictures with directions: {', '.join(t.member for t in found)}"
+        return (
+            f"{len(found)} lists of pictures with directions: {', '.join(t.member for t in found)}"
+        )
     return f"{found[0].member} lists {len(found[0].rows)} pictures with {found[0].kind}"
 
 

@@ -215,5 +215,5 @@ def test_settings_nested_too_deep_are_refused(make_measurement):
 @pytest.mark.parametrize("azimuth", ["9" * 400, "-" + "9" * 400])
 def test_an_azimuth_that_is_no_number_is_refused(azimuth):
     (light, _) = ubo.parse_name(f"tl030 pl{azimuth} tv000 pv000.png")
-    with pytest.raises(InputError, match="azimuth -?inf degrees"):
+    with pytest.raises(InputError, match=r"azimuth -?inf degrees"):
         ubo.direction(light, "x.png")

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from btfpipe.errors import InputError
 from btfpipe.directions import from_angles
+from btfpipe.errors import InputError
 from btfpipe.formats import pairs, ubo
 from btfpipe.formats.images import encode_picture
 from btfpipe.sample import Sample
@@ -308,7 +308,9 @@ def test_the_frontal_pair_is_one_nearest_the_normal(tmp_path, make_measurement):
         ingest_measurement(frontal(measurement), tmp_path / "one.npz")
     every, one = Sample.open(tmp_path / "all.npz"), Sample.open(tmp_path / "one.npz")
     np.testing.assert_allclose(one.light_directions, [[0, 0, 1]])
-    np.testing.assert_array_equal(one.codes[0], every.codes[np.argmax(every.light_directions[every.light_index, 2])])
+    np.testing.assert_array_equal(
+        one.codes[0], every.codes[np.argmax(every.light_directions[every.light_index, 2])]
+    )
 
 
 def test_of_pairs_equally_near_the_normal_the_first_is_frontal():
