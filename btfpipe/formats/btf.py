@@ -576,9 +576,9 @@ def write_btf(
     path,
     appearance,
     *,
-    terms=(32, 16, 16),
-    space="log_y_uv_over_y",
-    precision="half",
+    terms=None,
+    space=None,
+    precision=None,
     seed=0,
     threads=1,
     memory=2 << 30,
@@ -595,7 +595,10 @@ def write_btf(
     appearance : Appearance
         Of a product of views and lights. Some other readers also need as many lights as views, and colour model
         ``rgb`` or ``log_y_uv_over_y``.
-    terms, space, precision, seed, threads, memory, on_progress
+    terms, space, precision : optional
+        As in `compress_factored`, by default (32, 16, 16), ``log_y_uv_over_y`` and ``half``. A FactoredModel keeps its own;
+        others may not be asked for.
+    seed, threads, memory, on_progress
         As in `compress_factored`, where it is used.
 
     Returns
@@ -606,16 +609,20 @@ def write_btf(
     Raises
     ------
     InputError
-        If the pairs are not a product, or a FactoredModel does what the format cannot say.
+        If the pairs are not a product, or a FactoredModel does what the format cannot say, or has other terms, space or
+        precision than those given.
     """
     appearance.require_product("a .btf file")
     store.check_writable(path)
     model = appearance
-    if not isinstance(model, FactoredModel):
+    if isinstance(model, FactoredModel):
+        _require_own(model, terms, space, precision)
+    else:
+        given = {"terms": terms, "space": space, "precision": precision}
+        given = {name: value for name, value in given.items() if value is not None}
         model = compress_factored(
-            appearance, terms, space, precision=precision, seed=seed, threads=threads, memory=memory,
-            on_progress=on_progress,
-        )  # fmt: skip
+            appearance, **given, seed=seed, threads=threads, memory=memory, on_progress=on_progress
+        )
     number, flag = _expressible(model)
     light, view = (
         np.stack(to_angles(directions), axis=-1)
@@ -634,6 +641,25 @@ def write_btf(
         for angular, texture in zip(model.angular_factors, model.texture_factors, strict=True):
             _write_factors(file, angular, texture.reshape(rows * cols, -1))
     return model
+
+
+def _require_own(model, terms, space, precision):
+    """Refuse to write a FactoredModel otherwise than it is; None asks for nothing."""
+    half = all(factors.dtype == np.float16 for factors in model.angular_factors)
+    for what, given, own in (
+        ("terms", terms if terms is None else tuple(terms), model.n_terms),
+        ("space", space, model.space),
+        ("precision", precision, "half" if half else "single"),
+    ):
+        if given not in (None, own):
+            given, own = (
+                value if isinstance(value, str) else " ".join(map(str, value))
+                for value in (given, own)
+            )
+            raise InputError(
+                f"the model's {what}: {own}; asked for: {given}. A factored model is written as it is: leave that out, or"
+                " compress the Sample again."
+            )
 
 
 def _expressible(model):

@@ -33,7 +33,7 @@ from btfpipe.formats.compress_z import MAGIC, decompress
 from btfpipe.formats.curet_geometry import LARGEST_SHIFT, find_shifts, fit, outline, resample
 from btfpipe.formats.curet_writing import write_curet
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
-from btfpipe.formats.ubo import parse_name
+from btfpipe.formats.ubo import SETTINGS, parse_name
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.measurement import Measurement
 
@@ -86,6 +86,8 @@ class Listing:
         for name in archive.names:
             path = PurePosixPath(COPY.sub("", name))
             base, parts = path.name, path.parts[:-1]
+            if base == SETTINGS:
+                continue
             hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
             stem = _stem(base) if parse_name(base) is None else None
             numbers = re.findall(r"\d+", stem) if stem is not None else []
@@ -210,7 +212,7 @@ def open_measurement(
         calibration, source = _calibration(
             Path(path), archive, listing, sample_number or listing.sample_number
         )
-        mislabelled = []
+        mislabelled = set()
 
         def load(number):
             name = listing.pictures[number]
@@ -220,10 +222,8 @@ def open_measurement(
                 data = unpack_bmp(data, label)
                 name = re.sub(r"\.z$", "", name, flags=re.IGNORECASE)
             picture = decoder.decode(data, label)
-            original = listing.pictures[number]
-            # a picture is loaded for the fit and again when read
-            if is_mislabelled(COPY.sub("", name), picture.suffix) and original not in mislabelled:
-                mislabelled.append(original)
+            if is_mislabelled(COPY.sub("", name), picture.suffix):
+                mislabelled.add(listing.pictures[number])
             values = colours(picture, label)
             if values.dtype != np.uint8:
                 raise InputError(

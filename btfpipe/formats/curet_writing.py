@@ -4,19 +4,14 @@ The sample stands alone on a dark background, turned as the robot turns it, befo
 to the mechanics (shifts, scales) can be put in, so that what a reader finds can be compared with what is there.
 """
 
-import contextlib
-import shutil
-import zipfile
-from pathlib import Path
-
 import numpy as np
 
-from btfpipe import store
 from btfpipe.compiled import leaf
 from btfpipe.directions.curet import COUNT, curet205
 from btfpipe.errors import InputError
 from btfpipe.formats.compress_z import compress
 from btfpipe.formats.images import encode_picture
+from btfpipe.formats.writing import create_set
 from btfpipe.parallel import ordered_map
 
 SUFFIXES = (".bmp.Z", ".bmp", ".png")
@@ -33,9 +28,9 @@ def write_curet(
     frame=(480, 640),
     side=None,
     centre=None,
-    largest_value=1.0,
+    largest_value=None,
     offset=0.0,
-    calibrated=True,
+    calibrated=None,
     shifts=None,
     camera_scale=None,
     height=0.0,
@@ -48,7 +43,7 @@ def write_curet(
     Parameters
     ----------
     path : path-like
-        A zip if it ends in ``.zip``, else a folder, which must not be there.
+        A zip if it ends in ``.zip``, else a folder; see `writing.create_set`.
     appearance : Appearance
         Evaluated at each pair's directions; seen whole, row 0 at the top.
     sample_number : int
@@ -61,12 +56,13 @@ def write_curet(
         Pixels that the longer side of the patch has in a frontal view; by default 3/4 of the frame's shorter side.
     centre : (float, float), optional
         Row and column of the sample's middle; by default the frame's.
-    largest_value : float
-        Value of code 255; what is brighter is clipped.
+    largest_value : float, optional
+        Value of code 255; what is brighter is clipped. By default the largest that is drawn, so that nothing is; and at
+        least 1 if calibrated.
     offset : float
         Value of code 0.
-    calibrated : bool
-        Write ``acal.dat``, by which codes are values.
+    calibrated : bool, optional
+        Write ``acal.dat``, by which codes are values; by default if the Appearance's scale is absolute.
     shifts : (205, 2), optional
         Rows and columns, in pixels, by which each picture is displaced.
     camera_scale : (7,), optional
@@ -83,12 +79,12 @@ def write_curet(
     Returns
     -------
     dict
-        Facts: pictures written, clipped pixels.
+        Facts: pictures written, clipped pixels, largest_value, calibrated.
 
     Raises
     ------
     InputError
-        If the number or suffix is unknown, or the file cannot be written.
+        If the number or suffix is unknown, values are not finite or all below `offset`, or the file cannot be written.
     """
     from btfpipe.formats.curet import irradiance
 
@@ -104,9 +100,11 @@ def write_curet(
     shifts = np.zeros((COUNT, 2)) if shifts is None else np.asarray(shifts, float)
     shader = appearance.shader()
     at = np.indices(appearance.shape, np.float32).reshape(2, -1)
-    span = largest_value - offset
+    wanted = range(1, COUNT + 1) if numbers is None else sorted(set(numbers))
+    if calibrated is None:
+        calibrated = bool(getattr(appearance, "absolute", False))
 
-    def draw(number):
+    def shade(number):
         k = number - 1
         values = np.zeros((patch_rows * patch_cols, 3), np.float32)
         light, view = (
@@ -114,6 +112,24 @@ def write_curet(
             for d in (pairs.light, pairs.view)
         )
         shader.shade(*at, light, view, values)
+        return values
+
+    if largest_value is None:
+        # drawing only averages, so no pixel is brighter than the brightest texel
+        brightest = ordered_map(lambda number: shade(number).max(), wanted, threads)
+        largest = float(np.max([*brightest, np.float32(0)]))  # NaN stays, unlike in Python's max
+        if not np.isfinite(largest):
+            raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+        largest_value = max(largest, 1.0) if calibrated or largest == 0 else largest
+    span = largest_value - offset
+    if not span > 0:
+        raise InputError(
+            f"the largest value is {largest_value:g}, that of code 0 {offset:g}; expected a larger one."
+        )
+
+    def draw(number):
+        k = number - 1
+        values = shade(number)
         (right_s, right_t, right_n), (up_s, up_t, up_n) = pairs.projection[k]
         scale = scales[pairs.camera[k] - 1]
         # (col, -row) of the picture from (s, t), and back: then from picture to texel
@@ -136,8 +152,13 @@ def write_curet(
         data = encode_picture(codes, ".png" if suffix == ".png" else ".bmp")
         return number, compress(data) if suffix == ".bmp.Z" else data, clipped
 
-    facts = {"pictures": 0, "clipped_pixels": 0}
-    with _create(Path(path)) as put:
+    facts = {
+        "pictures": 0,
+        "clipped_pixels": 0,
+        "largest_value": largest_value,
+        "calibrated": calibrated,
+    }
+    with create_set(path, {"layout": "CUReT"}) as put:
         if calibrated:
             gain, at_zero = span / 255 * e0 / np.pi, offset * e0 / np.pi
             lines = [
@@ -145,7 +166,6 @@ def write_curet(
                 for n in range(1, _SAMPLES + 1)
             ]
             put("acal.dat", "".join(lines).encode())
-        wanted = range(1, COUNT + 1) if numbers is None else sorted(set(numbers))
         for number, data, clipped in ordered_map(draw, wanted, threads):
             put(f"sample{sample_number:02d}/{sample_number:02d}-{number:03d}{suffix}", data)
             facts["pictures"] += 1
@@ -189,36 +209,3 @@ def _project(values, affine, finer, out):
                         above = values[r, k, c] * (1 - u) + values[r, k1, c] * u
                         below = values[r1, k, c] * (1 - u) + values[r1, k1, c] * u
                         out[i, j, c] += share * (above * (1 - v) + below * v)
-
-
-@contextlib.contextmanager
-def _create(path):
-    """Yield ``put(name, data)``; the zip or folder appears only if the block succeeds."""
-    if path.suffix.lower() == ".zip":
-        with store.whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-
-            def add(name, data):
-                info = zipfile.ZipInfo(name)
-                info.external_attr = 0o644 << 16
-                archive.writestr(info, data)
-
-            yield add
-        return
-    if path.exists():
-        raise InputError(f"{path}: is there already; choose another name or remove it.")
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-
-    def put(name, data):
-        (part / name).parent.mkdir(parents=True, exist_ok=True)
-        (part / name).write_bytes(data)
-
-    try:
-        try:
-            part.mkdir()
-            yield put
-            part.replace(path)
-        except OSError as error:
-            raise InputError(store._cannot_write(path, error)) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)

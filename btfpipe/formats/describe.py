@@ -110,6 +110,7 @@ def _describe_measurement(measurement, threads, report):
     problems = [
         *_listed("pictures cannot be read", unreadable),
         *_listed("pictures hold values that are not finite", not_finite),
+        *_listed("pictures are mislabelled", sorted(measurement.facts.get("mislabelled", ()))),
     ]
     if len(kinds) > 1:
         sizes = [
@@ -129,10 +130,7 @@ def _describe_measurement(measurement, threads, report):
         "product": measurement.n_pairs == len(views) * len(lights),
         "clipped_values": clipped,
         "clipped_pictures": clipped_pictures,
-        "facts": {
-            key: value[:_LISTED] if isinstance(value, list) else value
-            for key, value in measurement.facts.items()
-        },
+        "facts": {key: _cut(value) for key, value in measurement.facts.items()},
         "problems": [*problems, *measurement.facts.get("warnings", [])],
     }
 
@@ -297,6 +295,13 @@ def _describe_set(path, threads, report):
 
 def _pair(view, light):
     return f"tl{light[0]:g} pl{light[1]:g} tv{view[0]:g} pv{view[1]:g}"
+
+
+def _cut(value):
+    """A fact, its first few things if it is a list or a set."""
+    if isinstance(value, set):
+        value = sorted(value)  # threads fill sets in any order
+    return value[:_LISTED] if isinstance(value, list) else value
 
 
 def _listed(what, things):

@@ -38,12 +38,17 @@ LIST = "directions.csv"
 _ENDINGS = (".csv", ".json")
 _MOST_LIST = 1 << 24  # bytes
 
+# A list by its columns: member, which of COLUMNS it has, rows (where in the file, dict), settings.
+_Table = namedtuple("_Table", "member kind rows settings")
 # A list as read: member, which of COLUMNS it has, names of pictures, numbers (pairs, 4 or 6), settings.
 _List = namedtuple("_List", "member kind names numbers settings")
 
 
 def recognise(path):
-    """Why a list, or a folder or zip with one, is taken for pictures with directions, in words, or None."""
+    """Why a list, or a folder or zip with some, is taken for pictures with directions, in words, or None.
+
+    Columns are enough: what is wrong below them, the reader says.
+    """
     try:
         source, wanted = _source(path, None)
         if not (source.is_dir() or is_zip(source)):
@@ -52,9 +57,13 @@ def recognise(path):
             found = _find(archive, wanted)
     except (InputError, OSError):
         return None
-    if len(found) != 1:
+    if not found:
         return None
-    return f"{found[0].member} lists {len(found[0].names)} pictures with {found[0].kind}"
+    if len(found) > 1:
+        return (
+            f"{len(found)} lists of pictures with directions: {', '.join(t.member for t in found)}"
+        )
+    return f"{found[0].member} lists {len(found[0].rows)} pictures with {found[0].kind}"
 
 
 @contextlib.contextmanager
@@ -82,22 +91,23 @@ def open_measurement(path, *, listing=None, patch_cm=None):
     """
     source, wanted = _source(path, listing)
     with open_archive(source) as archive, Decoder() as decoder:
-        found = _find(archive, wanted, strict=True)
+        found = _find(archive, wanted)
         if len(found) != 1:
             several = ", ".join(f.member for f in found) or "none"
+            which = " Say which with --listing." if found else ""
             raise InputError(
                 f"{path}: expected one .csv or .json that lists names of pictures and their directions; found"
-                f" {several}."
+                f" {several}.{which}"
             )
-        listed = found[0]
-        label = archive.label(listed.member)
+        label = archive.label(found[0].member)
+        listed = _read_list(found[0], label)
         settings = _settings(archive, listed, label)
         members = _members(archive, listed, label)
         lights, views = _directions(listed, label)
         facts = {
             "format": f"pairs ({listed.kind})",
             "strays": sorted({*archive.names} - {*members, listed.member}),
-            "mislabelled": [],
+            "mislabelled": set(),
         }
         lamps = None
         if listed.kind == "positions":
@@ -117,7 +127,7 @@ def open_measurement(path, *, listing=None, patch_cm=None):
         def read(pair):
             picture = decoder.decode(archive.read(members[pair]), labels[pair])
             if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].append(members[pair])
+                facts["mislabelled"].add(members[pair])
             return colours(picture, labels[pair])
 
         def correct(pair, picture):
@@ -202,83 +212,99 @@ def _source(path, listing):
     return path, listing
 
 
-def _find(archive, wanted, strict=False):
-    """Lists in an archive. If `strict`, the `wanted` one must be good, and what is wrong with a likely one is told."""
+def _find(archive, wanted):
+    """Lists in an archive, by their columns; the `wanted` one must be a list."""
     if wanted is not None and wanted not in archive.names:
         raise InputError(f"{archive.path}: holds no {wanted}; expected a list of pictures.")
-    names = [wanted] if wanted is not None else archive.names
+    if wanted is not None:
+        return [_read_table(archive, wanted)]
     found = []
-    for name in names:
+    for name in archive.names:
         base = PurePosixPath(name).name
         likely = base.lower().endswith(_ENDINGS) and base != ubo.SETTINGS
-        if wanted is None and (not likely or base.startswith(".") or "__MACOSX/" in name):
-            continue
-        listed = _read_list(archive, name, strict, wanted is not None)
-        if listed is not None:
-            found.append(listed)
+        if likely and not base.startswith(".") and "__MACOSX/" not in name:
+            with contextlib.suppress(InputError):
+                found.append(_read_table(archive, name))
     return found
 
 
-def _read_list(archive, name, strict, wanted):
-    """One list, or None for what is none; wrong numbers in a list raise if `strict`."""
+def _read_table(archive, name):
+    """A list, its rows not looked at yet."""
     label = archive.label(name)
+    if archive.size(name) > _MOST_LIST:
+        raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of pictures.")
+    data = archive.read(name)
     try:
-        if archive.size(name) > _MOST_LIST:
-            raise InputError(
-                f"{label}: longer than {_MOST_LIST} bytes; expected a list of pictures."
-            )
-        try:
-            text = archive.read(name).decode("utf-8-sig")
-            rows, settings = (_json if name.lower().endswith(".json") else _csv)(text)
-        except (ValueError, csv.Error, RecursionError) as error:
-            raise InputError(f"{label}: not a list of pictures ({error}).") from error
-        kind = next(
-            (k for k, c in COLUMNS.items() if rows and {"name", *c} <= rows[0].keys()), None
+        read = _json if name.lower().endswith(".json") else _csv
+        header, rows, settings = read(data.decode("utf-8-sig"))
+    except (ValueError, csv.Error, RecursionError) as error:
+        raise InputError(f"{label}: not a list of pictures ({error}).") from error
+    kind = next((k for k, c in COLUMNS.items() if {"name", *c} <= header), None)
+    if kind is None:
+        columns = "; ".join(", ".join(c) for c in COLUMNS.values())
+        raise InputError(
+            f"{label}: not a list of pictures; expected the columns name and one of: {columns}."
         )
-        if kind is None:
-            columns = "; ".join(", ".join(c) for c in COLUMNS.values())
-            raise InputError(
-                f"{label}: not a list of pictures; expected the columns name and one of: {columns}."
-            )
-    except InputError:
-        if wanted and strict:
-            raise
-        return None
+    return _Table(name, kind, rows, settings)
+
+
+def _read_list(table, label):
+    """The list that a table is, every number looked at; `label` is what messages call its file."""
+    if not table.rows:
+        raise InputError(f"{label}: lists no pictures; expected a row a picture.")
     names, numbers = [], []
-    for number, row in enumerate(rows, 1):
-        picture, values = row.get("name"), [_number(row.get(c)) for c in COLUMNS[kind]]
-        if not isinstance(picture, str) or not picture.strip() or not np.isfinite(values).all():
-            if not strict:
-                return None
+    for where, row in table.rows:
+        picture = row.get("name")
+        if not isinstance(picture, str) or not picture.strip():
+            raise InputError(f"{label}, {where}: has no name of a picture ({picture!r}).")
+        values = [_number(row.get(c)) for c in COLUMNS[table.kind]]
+        if not np.isfinite(values).all():
+            wrong = COLUMNS[table.kind][int(np.argmin(np.isfinite(values)))]
             raise InputError(
-                f"{label}: picture {number} ({picture!r}) needs a number for each of"
-                f" {', '.join(COLUMNS[kind])}."
+                f"{label}, {where} ({picture!r}): {wrong} is {_shown(row.get(wrong))}; expected a number for each of"
+                f" {', '.join(COLUMNS[table.kind])}."
             )
         names.append(picture.strip())
         numbers.append(values)
-    return _List(name, kind, names, np.array(numbers), settings)
+    return _List(table.member, table.kind, names, np.array(numbers), table.settings)
+
+
+def _shown(value):
+    """A cell in a message, cut short."""
+    if value is None or value == "":
+        return "missing"
+    shown = repr(value)
+    return shown if len(shown) <= 40 else shown[:40] + "..."
 
 
 def _csv(text):
-    """Rows of a CSV as dicts with lower-case keys; and settings, of which there are none."""
-    head = text.lstrip().partition("\n")[0]
+    """Columns of a CSV, in lower case; rows (where, dict); and settings, of which there are none."""
+    before = len(text) - len(text.lstrip())
+    text, above = text[before:], text[:before].count("\n")
+    head = text.partition("\n")[0]
     delimiter = next((d for d in ",;\t" if d in head), ",")
-    rows = csv.reader(io.StringIO(text.lstrip()), delimiter=delimiter, skipinitialspace=True)
-    header = [cell.strip().lower() for cell in next(rows, [])]
+    lines = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)
+    header = [cell.strip().lower() for cell in next(lines, [])]
     if len(set(header)) != len(header):
         raise ValueError("a column comes twice")
-    rows = [row + [""] * (len(header) - len(row)) for row in rows if any(row)]
-    return [dict(zip(header, row, strict=False)) for row in rows], {}
+    rows = []
+    for cells in lines:
+        if any(cells):
+            cells += [""] * (len(header) - len(cells))
+            row = dict(zip(header, cells, strict=False))
+            rows.append((f"line {above + lines.line_num}", row))
+    return set(header), rows, {}
 
 
 def _json(text):
-    """Rows and settings of a JSON list."""
+    """Columns, rows (where, dict) and settings of a JSON list."""
     whole = json.loads(text)
     rows = whole.get("pairs") if isinstance(whole, dict) else whole
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError("expected a list of objects, or an object with that as 'pairs'")
     settings = {k: v for k, v in whole.items() if k != "pairs"} if isinstance(whole, dict) else {}
-    return [{key.lower(): value for key, value in row.items()} for row in rows], settings
+    rows = [{key.lower(): value for key, value in row.items()} for row in rows]
+    return set().union(*rows), [(f"picture {i}", row) for i, row in enumerate(rows, 1)], settings
 
 
 def _number(value):

@@ -22,17 +22,25 @@ _MOST_LIST = 1 << 24  # bytes
 
 
 def recognise(path):
-    """Why a light list, or a folder or zip with one, is taken for RTI pictures, in words, or None."""
+    """Why a light list, or a folder or zip with some, is taken for RTI pictures, in words, or None.
+
+    A first line that is a number is enough: what is wrong below it, the reader says.
+    """
     try:
         source, wanted = _source(path, None)
         with open_archive(source) as archive:
-            lists = _lists(archive, wanted)
-            if len(lists) != 1:
-                return None
-            names, _ = _parse(archive, lists[0])
+            likely = {}
+            for name in _lists(archive, wanted):
+                with contextlib.suppress(InputError):
+                    likely[name] = _lines(archive, name)[1]
     except (InputError, OSError):
         return None
-    return f"{lists[0]} lists {len(names)} pictures with light directions"
+    if not likely:
+        return None
+    if len(likely) > 1:
+        return f"{len(likely)} lists of lights: {', '.join(likely)}"
+    ((name, count),) = likely.items()
+    return f"{name} lists {count} pictures with light directions"
 
 
 @contextlib.contextmanager
@@ -60,8 +68,9 @@ def open_measurement(path, *, listing=None):
     with open_archive(source) as archive, Decoder() as decoder:
         lists = _lists(archive, wanted)
         if len(lists) != 1:
+            which = " Say which with --listing." if lists else ""
             raise InputError(
-                f"{path}: expected one list of lights (.lp); found {', '.join(lists) or 'none'}."
+                f"{path}: expected one list of lights (.lp); found {', '.join(lists) or 'none'}.{which}"
             )
         names, lights = _parse(archive, lists[0])
         label = archive.label(lists[0])
@@ -72,13 +81,13 @@ def open_measurement(path, *, listing=None):
         facts = {
             "format": "RTI",
             "strays": sorted({*archive.names} - {*members, lists[0], beside}),
-            "mislabelled": [],
+            "mislabelled": set(),
         }
 
         def read(pair):
             picture = decoder.decode(archive.read(members[pair]), labels[pair])
             if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].append(members[pair])
+                facts["mislabelled"].add(members[pair])
             return colours(picture, labels[pair])
 
         def transfer(picture):
@@ -119,8 +128,8 @@ def _lists(archive, wanted):
     ]
 
 
-def _parse(archive, name):
-    """Names of pictures and unit vectors (n, 3) of a list."""
+def _lines(archive, name):
+    """Lines (number, text) of a list that are not empty, and the number of pictures that the first of them says."""
     label = archive.label(name)
     if archive.size(name) > _MOST_LIST:
         raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of lights.")
@@ -134,9 +143,16 @@ def _parse(archive, name):
     head = lines[0][1] if lines else ""
     if not (head.isascii() and head.isdigit() and len(head) < 10):
         raise InputError(f"{label}: begins with {head[:40]!r}; expected the number of pictures.")
-    if int(head) != len(lines) - 1 or len(lines) < 2:
+    return lines, int(head)
+
+
+def _parse(archive, name):
+    """Names of pictures and unit vectors (n, 3) of a list."""
+    label = archive.label(name)
+    lines, count = _lines(archive, name)
+    if count != len(lines) - 1 or len(lines) < 2:
         raise InputError(
-            f"{label}: announces {int(head)} pictures and lists {len(lines) - 1}; expected one line a picture."
+            f"{label}: announces {count} pictures and lists {len(lines) - 1}; expected one line a picture."
         )
     names, lights = [], []
     for number, line in lines[1:]:

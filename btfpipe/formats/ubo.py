@@ -7,6 +7,7 @@ Bonn's sets leave open: white, transfer, toroidal, texels_per_mm.
 
 import contextlib
 import json
+import math
 import re
 from pathlib import Path, PurePosixPath
 
@@ -119,6 +120,8 @@ def direction(angles, label):
         raise InputError(
             f"{label}: polar angle {theta:g} degrees; expected 0 to 90, a direction above the surface."
         )
+    if not math.isfinite(phi):
+        raise InputError(f"{label}: azimuth {phi:g} degrees; expected a finite number.")
     return (theta, round(phi % 360, 6) % 360 if theta > 0 else 0.0)
 
 
@@ -127,7 +130,7 @@ def read_settings(archive, name):
     label = archive.label(name)
     try:
         settings = json.loads(archive.read(name))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{label}: not JSON ({error}).") from error
     if not isinstance(settings, dict):
         raise InputError(f"{label}: holds no mapping of settings.")
@@ -191,12 +194,12 @@ def open_measurement(path, *, pairs=False, frontal=False):
         lights, views, light_index, view_index = tables(chosen)
         members = list(chosen.values())
         labels = [archive.label(name) for name in members]
-        mislabelled = []
+        mislabelled = set()
 
         def read(pair):
             picture = decoder.decode(archive.read(members[pair]), labels[pair])
             if is_mislabelled(members[pair], picture.suffix):
-                mislabelled.append(members[pair])
+                mislabelled.add(members[pair])
             return colours(picture, labels[pair])
 
         def transfer(picture):

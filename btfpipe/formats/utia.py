@@ -5,7 +5,8 @@ Names look like ``tl015_pl060_tv030_pv090.png`` below ``tv030_pv090/``. Eight-bi
 Where light and view coincide the camera would stand in the light, so the true light stood a little aside; a list of
 directions that comes with a set (columns: number, Theta, Phi, ThetaS, PhiS) says where, while the names keep the nominal
 angle. With that list the coincident pairs get lights of their own, and the set becomes a list of pairs, because a shifted light
-exists for one view only. Without it the nominal angles are kept, the set stays a product, and `warnings` says so.
+exists for one view only. Without it the nominal angles are kept, the set stays a product, and `warnings` says so; but names in a set that
+`write_utia` wrote say true angles.
 """
 
 import contextlib
@@ -27,6 +28,7 @@ COLOURS = ("xyz", "rgb")
 _NUMBER = r"-?\d+(?:\.\d+)?"
 _NAME = re.compile(rf"tl{_NUMBER}_pl{_NUMBER}_tv{_NUMBER}_pv{_NUMBER}\.(png|exr)", re.IGNORECASE)
 _MOST_LIST = 1 << 20  # bytes
+_LAYOUT = "UTIA"  # as our own sets say it
 
 
 def recognise(path):
@@ -131,12 +133,12 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
                 f"{path}: colour is {colour!r} in {ubo.SETTINGS}; expected xyz or rgb."
             )
         lights, views, light_index, view_index = ubo.tables(chosen)
-        facts = {"format": "UTIA", "strays": listing.strays, "mislabelled": []}
+        facts = {"format": "UTIA", "strays": listing.strays, "mislabelled": set()}
         facts["coincident_pairs"] = sum(view == light for view, light in chosen)
         if directions is not None:
             shifts = read_shifts(directions)
             lights, light_index, facts["shifted_lights"] = _shift(chosen, shifts, directions)
-        elif facts["coincident_pairs"]:
+        elif facts["coincident_pairs"] and settings.get("layout") != _LAYOUT:
             facts["warnings"] = [
                 f"{facts['coincident_pairs']} pairs have their light where their view is; their true lights stood"
                 " aside, as the set's list of directions says. Without it the nominal ones are kept."
@@ -147,7 +149,7 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
         def read(pair):
             picture = decoder.decode(archive.read(members[pair]), labels[pair])
             if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].append(members[pair])
+                facts["mislabelled"].add(members[pair])
             if picture.values.dtype.kind != "f":
                 return colours(picture, labels[pair])
             facts["colour"] = f"floating-point pictures are taken as {colour}"
@@ -252,7 +254,7 @@ def write_utia(path, appearance, suffix=".png", *, colour="xyz", on_progress=Non
     pictures = Pictures(appearance, suffix, transfer="srgb", convert=convert, **options)
     lights = angles_deg(appearance.light_directions)
     views = angles_deg(appearance.view_directions)
-    settings = pictures.settings | {"layout": "UTIA"}
+    settings = pictures.settings | {"layout": _LAYOUT}
     if suffix == ".exr":
         settings["colour"] = colour
     with create_set(path, settings) as add:

@@ -202,7 +202,8 @@ class Pictures:
         largest = float(np.abs(values).max())
         if not largest <= _HALF:
             raise InputError(
-                f"values reach {largest:.3g}, beyond half precision ({_HALF:.0f}); write them with single precision."
+                f"values reach {largest:.3g}, beyond half precision ({_HALF:.0f}), in which .exr is written; write .png,"
+                " whose values are scaled to fit."
             )
         return values.astype(np.float16)
 

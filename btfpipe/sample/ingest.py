@@ -7,6 +7,7 @@ import numpy as np
 from btfpipe import store
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map
+from btfpipe.sample.measurement import nearest_normal
 from btfpipe.sample.sample import Sample
 from btfpipe.sample.transfer import decode, decode_table, encode
 
@@ -87,7 +88,7 @@ def ingest(
     row, col, rows, cols = crop or (0, 0, *shape)
     texels = tuple(size or (rows, cols))
     curve = source_curve = transfer or measurement.transfer(first)
-    clipped_in = {}
+    stored, clipped_in = measurement, {}
     if measurement.correct is not None:
         measurement = _corrected(measurement, curve, clipped_in)
         curve, first = "linear", measurement.read(0)
@@ -99,7 +100,7 @@ def ingest(
             f"{measurement.source}: a patch that repeats has no drift to remove; leave --flatten out or say"
             " --not-toroidal."
         )
-    white = _white(measurement, white, grey_card, grey_card_reflectance, curve)
+    white = _white(measurement, stored, white, grey_card, grey_card_reflectance, curve)
     eight_bit = first.dtype == np.uint8
     dtype = first.dtype if first.dtype in (np.uint8, np.float16) else np.dtype(np.float32)
     convert = _converter(first.dtype, dtype, curve, (rows, cols), texels, toroidal)
@@ -303,29 +304,31 @@ def _inside(region, shape, option, measurement):
         )
 
 
-def _white(measurement, white, grey_card, reflectance, curve):
-    """Decoded value of a perfect white diffuser, or None if the scale is unknown."""
+def _white(measurement, stored, white, grey_card, reflectance, curve):
+    """Decoded value of a perfect white diffuser, or None if the scale is unknown.
+
+    Whether a grey card is clipped shows in the pictures as `stored`, before any correction.
+    """
     if grey_card is None:
         return white if white is not None else measurement.white
-    light = measurement.light_directions[measurement.light_index][:, 2]
-    view = measurement.view_directions[measurement.view_index][:, 2]
-    pair = int(
-        np.argmin(np.arccos(np.clip(light, -1, 1)) ** 2 + np.arccos(np.clip(view, -1, 1)) ** 2)
-    )
+    pair = nearest_normal(measurement)
     row, col, rows, cols = grey_card
-    card = measurement.read(pair)[row : row + rows, col : col + cols]
+    card = stored.read(pair)[row : row + rows, col : col + cols]
     full = _FULL.get(card.dtype)
     if full and card.max() == full:
         raise InputError(
             f"{measurement.names[pair]}: the grey card is clipped; choose a region without {full}, or"
             " give --white."
         )
+    if measurement is not stored:
+        card, full = measurement.read(pair)[row : row + rows, col : col + cols], None
     mean = float(decode(card / (full or 1), curve).mean())
     if not mean > 0:
         raise InputError(
             f"{measurement.names[pair]}: the grey card's region has the mean {mean:g}."
         )
-    return mean / (reflectance * float(light[pair]))
+    light = measurement.light_directions[measurement.light_index[pair]]
+    return mean / (reflectance * float(light[2]))
 
 
 def _density(measurement, texels_per_mm, shape, texels):
@@ -338,10 +341,10 @@ def _density(measurement, texels_per_mm, shape, texels):
 
 
 def _plain_facts(measurement):
-    """The reader's facts; lists sorted, as threads may have filled them in any order, and cut short."""
+    """The reader's facts; lists and sets sorted, as threads may have filled them in any order, and cut short."""
     facts = {}
     for key, value in measurement.facts.items():
-        if isinstance(value, list):
+        if isinstance(value, list | set):
             facts[f"n_{key}"] = len(value)
             value = sorted(value)[:_LISTED]
         facts[key] = value

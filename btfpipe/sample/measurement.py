@@ -1,7 +1,7 @@
 """What a reader of a foreign format hands to `ingest`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,3 +54,44 @@ class Measurement:
     @property
     def n_pairs(self):
         return len(self.light_index)
+
+
+def nearest_normal(measurement):
+    """The pair whose light and view are nearest the normal.
+
+    The sum of the squared polar angles is least; of several such pairs it is the first.
+    """
+    squares = [
+        np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2]) ** 2
+        for directions in (measurement.light_directions, measurement.view_directions)
+    ]
+    total = squares[0][measurement.light_index] + squares[1][measurement.view_index]
+    return int(np.argmin(np.round(total, 9)))  # equal angles differ by rounding
+
+
+def frontal(measurement):
+    """The one pair of a measurement that is nearest the normal, of light and view; see `nearest_normal`.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Open for as long as the result is used.
+
+    Returns
+    -------
+    Measurement
+        Of one light, one view and one pair; what else it says is the same.
+    """
+    pair = nearest_normal(measurement)
+    light, view = measurement.light_index[pair], measurement.view_index[pair]
+    correct = measurement.correct
+    return replace(
+        measurement,
+        light_directions=measurement.light_directions[light : light + 1],
+        view_directions=measurement.view_directions[view : view + 1],
+        light_index=np.zeros(1, np.int32),
+        view_index=np.zeros(1, np.int32),
+        names=[measurement.names[pair]],
+        read=lambda _: measurement.read(pair),
+        correct=correct and (lambda _, picture: correct(pair, picture)),
+    )

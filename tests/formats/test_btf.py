@@ -761,6 +761,25 @@ def test_what_the_format_cannot_say_is_not_written(make_sample, rng, tmp_path):
     assert not path.exists()
 
 
+def test_a_factored_model_is_not_asked_for_other_terms_in_vain(make_sample, rng, tmp_path):
+    path = tmp_path / "m.btf"
+    angular = [rng.random((133, n)).astype(np.float16) for n in (3, 2, 2)]
+    texture = [rng.random((4, 5, n)).astype(np.float16) for n in (3, 2, 2)]
+    model = FactoredModel(angular, texture, "yuv", make_sample())
+    for options, match in (
+        ({"terms": (4, 2, 2)}, "terms: 3 2 2; asked for: 4 2 2"),
+        ({"space": "rgb"}, "space: yuv; asked for: rgb"),
+        ({"precision": "single"}, "precision: half; asked for: single"),
+    ):
+        with pytest.raises(InputError, match=match):
+            write_btf(path, model, **options)
+    assert not path.exists()
+    write_btf(path, model, terms=[3, 2, 2], space="yuv", precision="half")
+    assert read_btf(path).n_terms == (3, 2, 2)
+    one, other = (write_btf(path, make_sample(), **k) for k in ({}, {"terms": (32, 16, 16)}))
+    assert one.n_terms == other.n_terms
+
+
 def test_an_unknown_cosine_is_refused(put, rng):
     with pytest.raises(InputError, match="expected inside or divided"):
         read_btf(put(dfmf(some_channels(rng))), cosine="outside")

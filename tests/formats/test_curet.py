@@ -26,7 +26,7 @@ FRAME = (112, 124)
 class Coated(Appearance):
     """A Lambertian texture with a highlight."""
 
-    toroidal, texels_per_mm = False, None
+    toroidal, texels_per_mm, absolute = False, None, True
 
     def __init__(self, albedo):
         self.albedo = np.asarray(albedo, np.float32)
@@ -502,11 +502,11 @@ def test_a_bmp_may_be_padded_and_carry_any_name(coated, tmp_path):
     file.write_bytes(compress(data))  # packed, though its name does not say so
     with curet.open_measurement(path, side=40) as measurement:
         assert measurement.read(0).shape == (40, 40, 3)
-        assert measurement.facts["mislabelled"] == []
+        assert measurement.facts["mislabelled"] == set()
     file.write_bytes(encode_picture(read_picture(data), ".png"))
     with curet.open_measurement(path, side=40) as measurement:
         measurement.read(0)
-        assert measurement.facts["mislabelled"] == ["sample05/05-054.bmp"]
+        assert measurement.facts["mislabelled"] == {"sample05/05-054.bmp"}
 
 
 def test_sets_without_usable_pictures_or_room_for_the_patch_are_refused(coated, tmp_path):
@@ -531,7 +531,7 @@ def test_the_writer_refuses_what_is_no_curet(coated, tmp_path):
         curet.write_curet(tmp_path / "x", coated, 62)
     with pytest.raises(InputError, match=r"\.tif: no ending"):
         curet.write_curet(tmp_path / "x", coated, 1, suffix=".tif")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="was not written by btfpipe"):
         curet.write_curet(tmp_path, coated, 1, frame=FRAME, numbers=[1])
     assert list(tmp_path.iterdir()) == []
 
@@ -543,6 +543,39 @@ def test_the_writer_counts_what_it_clips(coated, tmp_path):
     assert facts["clipped_pixels"] > 100
     with curet.open_measurement(tmp_path / "x", side=40) as measurement:
         assert measurement.facts["source_clipped_pixels"] >= facts["clipped_pixels"]
+
+
+def test_a_scale_that_is_not_known_is_not_claimed(coated, tmp_path):
+    for absolute, factor in ((False, 0.3), (False, 5), (True, 0.3), (True, 5)):
+        other = Coated(coated.albedo)
+        other.absolute = absolute
+        other.values = lambda light, view, f=factor: f * coated.values(light, view)
+        path = tmp_path / f"{absolute}{factor}"
+        facts = curet.write_curet(path, other, 5, frame=FRAME, suffix=".png", numbers=[54, 60])
+        largest = factor * max(coated.values(PAIRS.light[n], PAIRS.view[n]).max() for n in (53, 59))
+        expected = max(largest, 1) if absolute else largest
+        np.testing.assert_allclose(facts["largest_value"], expected, rtol=1e-6)
+        assert facts["clipped_pixels"] == 0
+        assert (path / "acal.dat").exists() == facts["calibrated"] == absolute
+        with (
+            curet.open_measurement(path, rectify=False) as measurement,
+        ):
+            assert measurement.white == (1 if absolute else None)
+            brightest = max(measurement.read(0).max(), measurement.read(1).max())
+            reached = brightest if absolute else brightest / 255 * largest
+            assert 0.9 * largest < reached < 1.01 * largest
+
+
+def test_a_set_of_our_own_is_written_over_and_nothing_else_is(coated, tmp_path):
+    path = tmp_path / "sample05"
+    curet.write_curet(path, coated, 5, frame=FRAME, numbers=[54, 60])
+    curet.write_curet(path, coated, 5, frame=FRAME, numbers=[30])
+    with curet.open_measurement(path, rectify=False) as measurement:
+        assert numbers_of(measurement).tolist() == [30]
+        assert measurement.facts["strays"] == []
+    with pytest.raises(InputError, match="expected a larger one"):
+        curet.write_curet(path, coated, 5, frame=FRAME, numbers=[54], offset=2.0)
+    assert [p.name for p in (path / "sample05").iterdir()] == ["05-030.bmp.Z"]
 
 
 def test_the_listing_finds_the_samples_number(coated, tmp_path):

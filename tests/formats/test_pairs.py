@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
-from btfpipe.formats import pairs, utia
+from btfpipe.formats import pairs, sources, utia
+from btfpipe.formats.describe import describe_foreign
 from btfpipe.formats.images import encode_picture
 from btfpipe.formats.pairs import correction, write_pairs
 from btfpipe.sample import Sample
@@ -176,10 +177,11 @@ POSITIONS = "name," + ",".join(pairs.COLUMNS["positions"]) + "\n"
     [
         ("", "expected one .csv or .json"),
         ("name,tl\na.png,3\n", "expected one .csv or .json"),
-        (HEAD, "expected one .csv or .json"),
-        (HEAD + "a.png,0,0,0\n", "picture 1 .*needs a number"),
-        (HEAD + "a.png,0,0,0,nan\n", "picture 1 .*needs a number"),
-        (HEAD + "a.png,0,0,0,1e999\n", "picture 1 .*needs a number"),
+        (HEAD, "lists no pictures"),
+        (HEAD + "a.png,0,0,0\n", r"line 2 \('a.png'\): phi_v is missing; expected a number"),
+        (HEAD + "\na.png,0,0,nan,0\n", r"line 3 \('a.png'\): theta_v is 'nan'"),
+        ("\n" + HEAD + "a.png,0,0,0,1e999\n", r"line 3 \('a.png'\): phi_v is '1e999'"),
+        (HEAD + " ,0,0,0,0\n", "line 2: has no name"),
         (HEAD + "a.png,0,0,95,0\n", "polar angle 95"),
         (HEAD + "b.png,0,0,0,0\n", r"1 of 1 pictures are not there \(first: 'b.png'\)"),
         (HEAD + "../a.png,0,0,0,0\n", "not there"),
@@ -201,6 +203,21 @@ def test_a_wrong_list_is_refused_with_the_reason(tmp_path, text, match):
             pass
 
 
+def test_a_list_with_a_wrong_number_is_still_taken_for_one(tmp_path):
+    picture = np.zeros((4, 4, 3), np.uint8)
+    folder = put(tmp_path / "set", HEAD + "a.png,0,0,0,0\nc.png,1x,0,0,0\n", {"a": picture})
+    for path in (folder, folder / "list.csv"):
+        assert sources.recognise(path)[0] == "pairs"
+    with pytest.raises(InputError, match=r"list\.csv, line 3 \('c\.png'\): theta_l is '1x'"):
+        sources.open_source(folder, "pairs").__enter__()
+    row = {"name": "a.png", "lx": 0, "ly": 0, "lz": 7, "vx": 1, "vy": 0}
+    (folder / "list.json").write_text(json.dumps([row, row | {"vz": 1}]))
+    assert sources.recognise(folder / "list.json")[0] == "pairs"
+    with pytest.raises(InputError, match=r"picture 1 \('a\.png'\): vz is missing"):
+        sources.open_source(folder / "list.json", "pairs").__enter__()
+    assert sources.recognise(folder)[1].startswith("2 lists of pictures")
+
+
 def test_a_patch_of_no_size_and_several_lists_are_refused(tmp_path):
     folder = put(
         tmp_path / "set", POSITIONS + "a.png,1,2,5,0,0,9\n", {"a": np.zeros((4, 4, 3), np.uint8)}
@@ -211,7 +228,7 @@ def test_a_patch_of_no_size_and_several_lists_are_refused(tmp_path):
             pass
     (folder / "btfpipe.json").unlink()
     (folder / "other.csv").write_text(HEAD + "a.png,0,0,0,0\n")
-    with pytest.raises(InputError, match=r"found list\.csv, other\.csv"):
+    with pytest.raises(InputError, match=r"found list\.csv, other\.csv.*--listing"):
         with pairs.open_measurement(folder):
             pass
     with pairs.open_measurement(folder, listing="other.csv") as measurement:
@@ -261,3 +278,25 @@ def test_lists_are_recognised_and_other_things_are_not(tmp_path, make_sample, ma
     ):
         assert pairs.recognise(path) is None
     assert utia.recognise(tmp_path / "set") is None
+
+
+def test_mislabelled_pictures_are_the_same_however_often_they_are_read(tmp_path):
+    n = 30
+    folder = tmp_path / "set"
+    folder.mkdir()
+    rows = "".join(f"{i:02d}.jpg,{i},0,0,0\n" for i in range(n))
+    (folder / "list.csv").write_text(HEAD + rows)
+    data = encode_picture(np.zeros((4, 4, 3), np.uint8), ".png")
+    for i in range(n):
+        (folder / f"{i:02d}.jpg").write_bytes(data)
+    with pairs.open_measurement(folder) as measurement:
+        for pair in (*range(n)[::-1], *range(n)):
+            measurement.read(pair)
+        facts = ingest(measurement, tmp_path / "s.npz", threads=2)
+    assert facts["n_mislabelled"] == n
+    assert facts["mislabelled"] == [f"{i:02d}.jpg" for i in range(20)]
+    described = describe_foreign(folder, threads=2)
+    assert described["facts"]["mislabelled"] == facts["mislabelled"]
+    (problem,) = described["problems"]
+    assert problem.startswith("30 pictures are mislabelled: 00.jpg, 01.jpg,")
+    json.dumps(described["facts"])

@@ -5,7 +5,7 @@ import pytest
 
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
-from btfpipe.formats import rti
+from btfpipe.formats import rti, sources
 from btfpipe.formats.images import encode_picture
 from btfpipe.formats.rti import write_lp
 from btfpipe.sample import Sample
@@ -88,17 +88,25 @@ def test_a_wrong_list_is_refused_with_the_reason(lp, text, match):
             pass
 
 
+def test_a_list_with_a_wrong_number_is_still_taken_for_one(lp):
+    folder, _ = lp("2\nfirst light.png 0 0 1\nin/b.PNG 0 one 1\n")
+    for path in (folder, folder / "list.lp"):
+        assert sources.recognise(path)[0] == "rti"
+        with pytest.raises(InputError, match=r"list\.lp, line 3: 'in/b\.PNG 0 one 1'"):
+            sources.open_source(path, "rti").__enter__()
+
+
 def test_a_folder_without_a_list_or_with_two_is_refused(tmp_path, lp):
     with pytest.raises(InputError, match="found none"), rti.open_measurement(tmp_path):
         pass
     folder, _ = lp("1\nfirst light.png 0 0 1\n")
     (folder / "other.lp").write_text("1\nin/b.PNG 0 0 1\n")
     with (
-        pytest.raises(InputError, match=r"found list\.lp, other\.lp"),
+        pytest.raises(InputError, match=r"found list\.lp, other\.lp.*--listing"),
         rti.open_measurement(folder),
     ):
         pass
-    assert rti.recognise(folder) is None
+    assert sources.recognise(folder) == ("rti", "2 lists of lights: list.lp, other.lp")
     with rti.open_measurement(folder, listing="other.lp") as measurement:
         assert measurement.n_pairs == 1
     with pytest.raises(InputError, match="found none"):

@@ -203,3 +203,17 @@ def test_two_members_of_one_name_are_a_pair_there_twice(make_measurement):
     with pytest.raises(InputError, match=r"there twice .*member 2 of that name"):
         with ubo.open_measurement(path):
             pass
+
+
+def test_settings_nested_too_deep_are_refused(make_measurement):
+    path, _ = make_measurement(change=lambda m: m.update({"btfpipe.json": "[" * 200_000}))
+    with pytest.raises(InputError, match=r"btfpipe\.json: not JSON"):
+        with ubo.open_measurement(path):
+            pass
+
+
+@pytest.mark.parametrize("azimuth", ["9" * 400, "-" + "9" * 400])
+def test_an_azimuth_that_is_no_number_is_refused(azimuth):
+    (light, _) = ubo.parse_name(f"tl030 pl{azimuth} tv000 pv000.png")
+    with pytest.raises(InputError, match=r"azimuth -?inf degrees"):
+        ubo.direction(light, "x.png")

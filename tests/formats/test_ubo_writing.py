@@ -95,3 +95,13 @@ def test_a_model_is_written_as_its_pictures(tmp_path, rng):
     largest = model.pictures(slice(0, 81)).max()
     # the model's scale is unknown, so its largest value became the largest code
     np.testing.assert_allclose(back.pictures([0, 40, 80]) * max(largest, 1), expected, atol=0.01)
+
+
+def test_values_beyond_half_precision_are_refused_with_a_way_out(tmp_path, make_sample):
+    sample = make_sample(4, 4, scale=1e6)
+    with pytest.raises(InputError, match=r"beyond half precision.*write \.png"):
+        write_ubo(tmp_path / "set", sample, ".exr")
+    write_ubo(tmp_path / "set", sample, ".png")
+    with ubo.open_measurement(tmp_path / "set") as measurement:
+        codes = np.stack([measurement.read(pair) for pair in range(measurement.n_pairs)])
+    assert 250 <= codes.max() <= 255

@@ -90,10 +90,23 @@ def test_eight_bit_codes_come_back_as_they_were(tmp_path, make_sample):
 
 def test_without_the_list_the_nominal_light_is_kept_with_a_warning(tmp_path, make_sample):
     write_utia(tmp_path / "set", make_sample(2, 2, lights=bonn81()[:7], views=bonn81()[:7]))
+    (tmp_path / "set/btfpipe.json").unlink()  # as UTIA's own sets come
     with utia.open_measurement(tmp_path / "set") as measurement:
         assert measurement.facts["coincident_pairs"] == 7
         assert "7 pairs" in measurement.facts["warnings"][0]
         assert len(measurement.light_directions) == 7
+
+
+def test_names_in_a_set_of_our_own_say_true_angles(tmp_path, make_sample):
+    directions = bonn81()[:3]
+    sample = make_sample(4, 4, lights=directions, views=directions)
+    write_utia(tmp_path / "set", sample)
+    with utia.open_measurement(tmp_path / "set") as measurement:
+        assert measurement.facts["coincident_pairs"] == 3
+        assert "warnings" not in measurement.facts
+    (tmp_path / "set/btfpipe.json").write_text('{"white": 0.5}')  # as a user adds it to UTIA's own
+    with utia.open_measurement(tmp_path / "set") as measurement:
+        assert len(measurement.facts["warnings"]) == 1
 
 
 def test_with_the_list_coincident_pairs_get_their_true_light(tmp_path, make_sample):

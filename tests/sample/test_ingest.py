@@ -3,12 +3,14 @@ import json
 import numpy as np
 import pytest
 
+from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
-from btfpipe.formats import ubo
+from btfpipe.formats import pairs, ubo
 from btfpipe.formats.images import encode_picture
 from btfpipe.sample import Sample
 from btfpipe.sample.ingest import drift_gain
 from btfpipe.sample.ingest import ingest as ingest_measurement
+from btfpipe.sample.measurement import Measurement, frontal
 
 
 @pytest.fixture
@@ -259,3 +261,65 @@ def test_a_picture_with_values_that_are_not_finite_is_named(
 def test_a_crop_outside_the_pictures_is_refused(make_measurement, ingest, crop):
     with pytest.raises(InputError, match=r"--crop .* does not lie inside .* 6 x 8 pixels"):
         ingest(make_measurement()[0], crop=crop)
+
+
+def near_lamps(folder, codes):
+    """Pictures of one view under near lamps, the second overhead."""
+    folder.mkdir()
+    text = "name,lamp_x,lamp_y,lamp_z,camera_x,camera_y,camera_z\n"
+    for i, (picture, lamp) in enumerate(zip(codes, ("20,0,20", "0,0,30"), strict=True)):
+        (folder / f"{i}.png").write_bytes(encode_picture(picture, ".png"))
+        text += f"{i}.png,{lamp},0,0,50\n"
+    (folder / "list.csv").write_text(text)
+    return pairs.open_measurement(folder, patch_cm=(10, 10))
+
+
+def test_a_clipped_grey_card_under_a_near_lamp_is_refused(tmp_path):
+    codes = np.full((2, 8, 8, 3), 100, np.uint8)
+    codes[1, 3, 3, 1] = 255
+    card = {"grey_card": (2, 2, 3, 3), "grey_card_reflectance": 0.5}
+    with near_lamps(tmp_path / "clipped", codes) as measurement:
+        with pytest.raises(InputError, match="grey card is clipped"):
+            ingest_measurement(measurement, tmp_path / "s.npz", **card)
+    codes[1, 3, 3, 1] = 100
+    with near_lamps(tmp_path / "good", codes) as measurement:
+        # the corrected pictures are what the card is measured in
+        linear = ((100 / 255 + 0.055) / 1.055) ** 2.4
+        factors = pairs.correction((8, 8), (10, 10), np.array([0, 0, 30.0]), (800**0.5 + 30) / 2)
+        facts = ingest_measurement(measurement, tmp_path / "s.npz", **card)
+    np.testing.assert_allclose(facts["white"], linear * factors[2:5, 2:5].mean() / 0.5, rtol=1e-3)
+
+
+def test_the_frontal_pair_is_one_nearest_the_normal(tmp_path, make_measurement):
+    path, _ = make_measurement()
+    with (
+        ubo.open_measurement(path) as whole,
+        ubo.open_measurement(path, frontal=True) as known,
+    ):
+        one = frontal(whole)
+        assert one.names == known.names
+        np.testing.assert_array_equal(one.read(0), known.read(0))
+        np.testing.assert_array_equal(one.light_directions, known.light_directions)
+        np.testing.assert_array_equal(one.view_directions, known.view_directions)
+        assert (one.n_pairs, one.white, one.toroidal) == (1, whole.white, whole.toroidal)
+    codes = np.stack([np.full((4, 4, 3), code, np.uint8) for code in (50, 100)])
+    with near_lamps(tmp_path / "lamps", codes) as measurement:
+        ingest_measurement(measurement, tmp_path / "all.npz")
+        ingest_measurement(frontal(measurement), tmp_path / "one.npz")
+    every, one = Sample.open(tmp_path / "all.npz"), Sample.open(tmp_path / "one.npz")
+    np.testing.assert_allclose(one.light_directions, [[0, 0, 1]])
+    np.testing.assert_array_equal(
+        one.codes[0], every.codes[np.argmax(every.light_directions[every.light_index, 2])]
+    )
+
+
+def test_of_pairs_equally_near_the_normal_the_first_is_frontal():
+    azimuths = np.radians([200, 10, 100, 300])
+    directions = from_angles(np.radians([30, 30, 30, 40]), azimuths)
+    tables = directions, directions[::-1]
+    for order in ([0, 1, 2, 3], [2, 1, 0, 3], [3, 1, 2, 0]):
+        order = np.array(order)
+        measurement = Measurement(
+            "x", *tables, order, 3 - order, [str(i) for i in order], read=int, transfer=str
+        )
+        assert frontal(measurement).names == [str(next(i for i in order if i != 3))]
