@@ -31,7 +31,7 @@ _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
     type=click.IntRange(min=1),
     nargs=3,
     metavar="Y U V",
-    help="Terms of luminance and of each chroma of a .btf; a Model of method factored keeps its own.  [default: 32 16 16]",
+    help="Terms of luminance and of each chroma of a .btf; a Model of method factored is written as it is.  [default: 32 16 16]",
 )
 @stage(folder=True)
 def export(

@@ -128,6 +128,7 @@ def ingest(source, format_, out, threads, quiet, **options):
     from btfpipe.compression.model import Model
     from btfpipe.formats import sources
     from btfpipe.sample.ingest import ingest as ingest_measurement
+    from btfpipe.sample.measurement import frontal as nearest_only
 
     if (options["grey_card"] is None) != (options["grey_card_reflectance"] is None):
         raise click.UsageError("--grey-card and --grey-card-reflectance go together.")
@@ -144,6 +145,7 @@ def ingest(source, format_, out, threads, quiet, **options):
     if "transfer" in takes:
         own["transfer"] = options.pop("transfer")
     own = {key: value for key, value in own.items() if value not in (None, False)}
+    frontal = own.pop("frontal", False) if "frontal" not in takes else False
     for key in own:
         if key not in takes:
             raise click.UsageError(
@@ -153,6 +155,8 @@ def ingest(source, format_, out, threads, quiet, **options):
     told = {"inputs": [source], "taken_for": name, "because": reason}
     opened = sources.open_source(source, name, **own)
     if isinstance(opened, Model):
+        if frontal:
+            raise click.UsageError(f"{source} is compressed already; --frontal is for pictures.")
         given = [
             key
             for key, value in options.items()
@@ -166,6 +170,8 @@ def ingest(source, format_, out, threads, quiet, **options):
         opened.save(out)
         return told | _facts_of(opened)
     with opened as measurement, progress("pictures", quiet) as report:
+        if frontal:
+            measurement = nearest_only(measurement)
         facts = ingest_measurement(
             measurement, out, threads=threads, report=report, about=about, **options
         )

@@ -235,3 +235,21 @@ def test_a_model_is_no_sample(tmp_path):
     store.write(tmp_path / "m.npz", "model", {"x": np.zeros(3)})
     with pytest.raises(InputError, match=r"m.npz: holds a model. Expected a sample made by"):
         Sample.open(tmp_path / "m.npz")
+
+
+def test_the_frontal_pair_is_taken_of_any_format(btfpipe, make_sample, tmp_path):
+    from btfpipe.directions import bonn81
+    from btfpipe.formats.images import write_picture
+    from btfpipe.sample import Sample
+
+    make_sample(8, 8, lights=bonn81()[:7], views=bonn81()[:3]).save(tmp_path / "s.npz")
+    for format_ in ("pairs", "rti"):
+        target = tmp_path / f"{format_}.zip"
+        btfpipe("export", tmp_path / "s.npz", "--format", format_, "-o", target)
+        btfpipe("ingest", target, "--frontal", "-o", tmp_path / f"{format_}.npz")
+        sample = Sample.open(tmp_path / f"{format_}.npz")
+        assert sample.n_pairs == 1
+        assert sample.light_directions[0, 2] == pytest.approx(1)
+    write_picture(tmp_path / "p.png", np.zeros((4, 5, 3), np.uint8))
+    btfpipe("ingest", tmp_path / "p.png", "--frontal", "-o", tmp_path / "p.npz")
+    assert Sample.open(tmp_path / "p.npz").shape == (4, 5)
