@@ -37,10 +37,38 @@ class CodedShader(PairShader):
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
-def _roots(near, weights, pair, out):
-    """One colour of a pair at the four texels of `near`."""
-    # rows of their own, or the compiler does not use vectors
-    row = weights[pair]
+def _roots(near, x, y, z, common, out):
+    """The three colours of a pair, of weights x, y, z, at the four texels of `near`, over the terms that all have."""
+    # rows of their own, or the compiler does not use vectors; texels are loaded once for three colours
+    n0 = near[0]
+    n1 = near[1]
+    n2 = near[2]
+    n3 = near[3]
+    zero = np.float32(0)
+    x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = zero
+    for k in range(common):
+        x0 += n0[k] * x[k]
+        x1 += n1[k] * x[k]
+        x2 += n2[k] * x[k]
+        x3 += n3[k] * x[k]
+        y0 += n0[k] * y[k]
+        y1 += n1[k] * y[k]
+        y2 += n2[k] * y[k]
+        y3 += n3[k] * y[k]
+        z0 += n0[k] * z[k]
+        z1 += n1[k] * z[k]
+        z2 += n2[k] * z[k]
+        z3 += n3[k] * z[k]
+    out[0, 0], out[0, 1], out[0, 2], out[0, 3] = x0, x1, x2, x3
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = y0, y1, y2, y3
+    out[2, 0], out[2, 1], out[2, 2], out[2, 3] = z0, z1, z2, z3
+
+
+@leaf(fastmath={"contract", "reassoc", "nsz"})
+def _add_terms(near, row, common, out):
+    """Add the terms that one colour has beyond those of all."""
+    if len(row) <= common:
+        return
     n0 = near[0]
     n1 = near[1]
     n2 = near[2]
@@ -49,15 +77,15 @@ def _roots(near, weights, pair, out):
     b = np.float32(0)
     c = np.float32(0)
     d = np.float32(0)
-    for k in range(len(row)):
+    for k in range(common, len(row)):
         a += n0[k] * row[k]
         b += n1[k] * row[k]
         c += n2[k] * row[k]
         d += n3[k] * row[k]
-    out[0] = a
-    out[1] = b
-    out[2] = c
-    out[3] = d
+    out[0] += a
+    out[1] += b
+    out[2] += c
+    out[3] += d
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
@@ -65,6 +93,7 @@ def _shade(
     texture, first, second, third, colour, rows, cols, toroidal, row, col, pair, share, near, root, texel,
     bilinear, out,
 ):  # fmt: skip
+    common = min(first.shape[1], second.shape[1], third.shape[1])
     for q in range(len(row)):
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
         for t in range(4):
@@ -77,16 +106,20 @@ def _shade(
             weight = share[q, p]
             if weight == 0:
                 continue
-            _roots(near, first, pair[q, p], root[0])
-            _roots(near, second, pair[q, p], root[1])
-            _roots(near, third, pair[q, p], root[2])
+            x = first[pair[q, p]]
+            y = second[pair[q, p]]
+            z = third[pair[q, p]]
+            _roots(near, x, y, z, common, root)
+            _add_terms(near, x, common, root[0])
+            _add_terms(near, y, common, root[1])
+            _add_terms(near, z, common, root[2])
             for t in range(4):
-                x = root[0, t]
-                y = root[1, t]
-                z = root[2, t]
-                r = colour[0, 0] * x + colour[0, 1] * y + colour[0, 2] * z
-                g = colour[1, 0] * x + colour[1, 1] * y + colour[1, 2] * z
-                b = colour[2, 0] * x + colour[2, 1] * y + colour[2, 2] * z
+                u = root[0, t]
+                v = root[1, t]
+                w = root[2, t]
+                r = colour[0, 0] * u + colour[0, 1] * v + colour[0, 2] * w
+                g = colour[1, 0] * u + colour[1, 1] * v + colour[1, 2] * w
+                b = colour[2, 0] * u + colour[2, 1] * v + colour[2, 2] * w
                 part = weight * bilinear[t]
                 red += part * (r * abs(r))
                 green += part * (g * abs(g))
