@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, naming, progress, stage
 
 _WAYS = ("barycentric", "four", "nearest")
 _DEFINITIONS = {
@@ -102,9 +102,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
         for row in rows:
-            options = " ".join(
-                f"--{name.replace('_', '-')} {value}" for name, value in row["options"].items()
-            )
+            options = " ".join(f"{flag(name)} {value}" for name, value in row["options"].items())
             what = row.get("skipped") or (
                 f"{row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
                 f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s"

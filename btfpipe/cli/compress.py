@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, Memory, input_file, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, Memory, flag, input_file, naming, progress, stage
 
 # As in btfpipe.compression.METHODS, which is not imported for --help.
 _METHODS = ("coded", "svd", "view-pca", "local-pca", "harmonics", "factored")
@@ -103,7 +103,7 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
         if value is not None and name not in takes:
             how = " channel by channel" if method == "svd" and apart else ""
             raise click.UsageError(
-                f"method {method}{how} has no {_flag(name)}; it takes {', '.join(map(_flag, takes))}."
+                f"method {method}{how} has no {flag(name)}; it takes {', '.join(map(flag, takes))}."
             )
     if len(samples) > 1 and method not in DATABASES:
         raise click.UsageError(
@@ -156,7 +156,3 @@ def _names(samples):
             f"the materials of a database take the names of their files, and {names} are not all different."
         )
     return names
-
-
-def _flag(name):
-    return "--" + name.replace("_", "-")

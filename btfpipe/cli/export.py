@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import input_file, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, naming, progress, stage
 
 # As in btfpipe.formats.targets, which is not imported for --help.
 _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
@@ -60,7 +60,7 @@ def export(
     options = {name: value for name, value in options.items() if value is not None}
     for name in options:
         if name not in targets.WRITERS[format_].options:
-            raise click.UsageError(f"--{name.replace('_', '-')} is not for {format_}.")
+            raise click.UsageError(f"{flag(name)} is not for {format_}.")
     if format_ == "btf":  # factorised on the way
         options |= {"seed": seed, "memory": memory}
     appearance = open_appearance(source)

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from btfpipe import store
-from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
+from btfpipe.cli.options import FiniteFloat, flag, input_file, progress, stage
 from btfpipe.errors import InputError
 
 MOST_TEXELS = 16384  # a side
@@ -149,7 +149,7 @@ def ingest(source, format_, out, threads, quiet, **options):
     for key in own:
         if key not in takes:
             raise click.UsageError(
-                f"{_flag(key)} is not for {name}, which {source} is taken for ({reason})."
+                f"{flag(key)} is not for {name}, which {source} is taken for ({reason})."
             )
     about = {"name": Path(source).name, "digest": store.digest(source)}
     told = {"inputs": [source], "taken_for": name, "because": reason}
@@ -164,7 +164,7 @@ def ingest(source, format_, out, threads, quiet, **options):
         ]
         if given:
             raise click.UsageError(
-                f"{source} is compressed already and is kept as it is; {_flag(given[0])} is for pictures."
+                f"{source} is compressed already and is kept as it is; {flag(given[0])} is for pictures."
             )
         opened.about |= about
         opened.save(out)
@@ -185,10 +185,6 @@ def ingest(source, format_, out, threads, quiet, **options):
 _OF_FORMATS = (
     "pairs", "frontal", "directions", "colour", "listing", "patch_cm", "sample_number",
 )  # fmt: skip
-
-
-def _flag(name):
-    return "--" + name.replace("_", "-")
 
 
 def _facts_of(model):

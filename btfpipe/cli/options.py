@@ -233,6 +233,11 @@ def input_file(**kwargs):
     return click.Path(exists=True, path_type=Path, **kwargs)
 
 
+def flag(name):
+    """An option as it is typed, from its name in Python."""
+    return "--" + name.replace("_", "-")
+
+
 @contextlib.contextmanager
 def naming(path):
     """Put a file's name in front of what goes wrong in the block, unless the message has it."""
