@@ -4,7 +4,9 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
+from btfpipe.compression.coded import compress_coded
 from btfpipe.compression.svd import SvdModel
 from btfpipe.directions import bonn81
 from btfpipe.parallel import available_threads
@@ -93,17 +95,20 @@ def _ring(around=700, across=360):
     return level, CoordinateMap(row, col, 0 * row, per_unit, {})
 
 
-def _model():
+def _model(method):
+    """Of the method, with its default number of terms."""
     rng = np.random.default_rng(5)
     directions, pair = bonn81(), np.arange(6561)
     tiny = Sample(
         np.zeros((6561, 1, 1, 3), np.uint8), directions, directions, pair % 81, pair // 81, toroidal=True
     )  # fmt: skip
     texture = rng.standard_normal((SIDE, SIDE, TERMS), np.float32)
-    return SvdModel(texture, rng.standard_normal((6561, 3, TERMS), np.float32), tiny)
+    model = SvdModel(texture, rng.standard_normal((6561, 3, TERMS), np.float32), tiny)
+    return model if method == "svd" else compress_coded(model, threads=available_threads())
 
 
-def test_picture_under_fifty_lights(benchmark):
+@pytest.mark.parametrize("method", ["svd", "coded"])
+def test_picture_under_fifty_lights(benchmark, method):
     """640 x 480, 4 rays a pixel, shadows, a ring on a ground; against as many pictures of one light each."""
     from btfpipe.rendering import objects
     from btfpipe.rendering.camera import make_camera
@@ -111,7 +116,7 @@ def test_picture_under_fifty_lights(benchmark):
     from btfpipe.rendering.scene import Film, Light, Scene
 
     level, coordinates = _ring()
-    thing = objects.dressed_surface(level, coordinates, _model(), "barycentric")
+    thing = objects.dressed_surface(level, coordinates, _model(method), "barycentric")
     ground = objects.flat(
         {"center": [0, -1.4, 0], "s": [1, 0, 0], "t": [0, 0, -1], "size": [100, 100]}, [0.5] * 3
     )
@@ -146,7 +151,7 @@ def test_picture_under_fifty_lights(benchmark):
         threads=threads,
     )
     sys.stdout.write(
-        f"\n640 x 480, 4 rays a pixel, {len(lights)} lights, SVD-{TERMS} of 81 x 81 directions, {threads} threads:"
+        f"\n640 x 480, 4 rays a pixel, {len(lights)} lights, {method} of {SIDE}² x 81 x 81, {threads} threads:"
         f" {seconds:.1f} s after loading, {processor:.1f} s of processor time ({100 * dressed:.0f} % dressed,"
         f" {100 * hit:.0f} % hit); {ratio:.1f} times as fast as one light at a time\n"
     )

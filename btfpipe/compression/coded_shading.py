@@ -5,11 +5,14 @@ import numpy as np
 from btfpipe.compiled import leaf
 from btfpipe.sample.shading import PairShader, corners
 
+_MANY_LIGHTS = 4  # as measured, at 1 to 4 pixels a texel
+
 
 class CodedShader(PairShader):
     """Evaluates a `CodedModel` between its texels, lights and views.
 
-    Roots are not linear in the values: every value that is blended (1, 4, 9 or 16 pairs; 4 texels) is made first.
+    Roots are not linear in the values: every value that is blended (1, 4, 9 or 16 pairs; 4 texels) is made first. Under many
+    lights that is done once for all: see `LightSlices`.
 
     Parameters
     ----------
@@ -23,6 +26,8 @@ class CodedShader(PairShader):
         self.texture = model.texture_factors.reshape(-1, model.n_terms)
         self.angular = model.angular_factors
         self.colour = model.colour
+        if self.pairs.near is None:
+            self.many_lights = _MANY_LIGHTS
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -34,6 +39,30 @@ class CodedShader(PairShader):
                 self.texture, *self.angular, self.colour, self.rows, self.cols, self.toroidal,
                 row[part], col[part], pair, share, near, root, texel, bilinear, out[part],
             )  # fmt: skip
+
+    def seen(self, texels, view):
+        """Values (n, lights, 3) float32 of texels (n,) from a measured view under every measured light."""
+        near = self.texture[texels]
+        count = len(self.pairs.inverse_cosines)
+        pairs = slice(view * count, (view + 1) * count)
+        roots = [near[:, : a.shape[1]] @ a[pairs].T for a in self.angular]
+        out = np.empty((len(texels), count, 3), np.float32)
+        _square(*roots, self.colour, out)
+        return out
+
+
+@leaf(fastmath={"contract"})
+def _square(first, second, third, colour, out):
+    """Values of the roots (n, m) of three colours."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            for c in range(3):
+                root = (
+                    colour[c, 0] * first[i, j]
+                    + colour[c, 1] * second[i, j]
+                    + colour[c, 2] * third[i, j]
+                )
+                out[i, j, c] = root * abs(root)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})

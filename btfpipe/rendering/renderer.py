@@ -2,26 +2,33 @@
 
 import numpy as np
 
-from btfpipe.parallel import ordered_map
+from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.clearance import clearance
+from btfpipe.sample.light_slices import LightSlices
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
-_RAYS = (
-    1 << 16
-)  # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
+# of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
+_RAYS = 1 << 16
 _RAY_BYTES = 600  # origin, direction, hit, point, light, look-ups
 
 
-def tile_side(samples):
-    """Pixels along a tile's side at this many rays a pixel."""
-    return min(max(int(np.sqrt(_RAYS / samples)), 8), 256)
+def tile_side(samples, slice_bytes=0):
+    """Pixels along a tile's side at this many rays a pixel; smaller if a ray's look-up keeps so many bytes of a slice."""
+    rays = _RAYS * _RAY_BYTES / (_RAY_BYTES + slice_bytes)
+    return min(max(int(np.sqrt(rays / samples)), 8), 256)
 
 
 def tile_bytes(samples):
     """Most bytes that a thread holds for the rays of one tile, over surfaces of one layer."""
     return tile_side(samples) ** 2 * samples * _RAY_BYTES
+
+
+def _has_many(lights, shader):
+    """Whether slices are faster than one light after the other."""
+    many = getattr(shader, "many_lights", None)
+    return many is not None and len(lights) >= many
 
 
 class Renderer:
@@ -50,6 +57,11 @@ class Renderer:
         self.faces = np.concatenate(
             [t.faces + n for t, n in zip(scene.objects, first_vertex, strict=False)]
         ).astype(np.int32)
+        self.sliced = {
+            number: thing.dressing.shader
+            for number, thing in enumerate(scene.objects)
+            if thing.dressing is not None and _has_many(scene.lights, thing.dressing.shader)
+        }
         self.table = filter_table(scene.film.filter, scene.film.radius)
         # single precision positions are this far off at the scene's size
         self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
@@ -61,7 +73,8 @@ class Renderer:
     def tiles(self):
         """Rectangles (x, y, width, height) that cover the film."""
         film = self.scene.film
-        side = tile_side(film.samples)
+        most = max((shader.slice_bytes for shader in self.sliced.values()), default=0)
+        side = tile_side(film.samples, most)
         return [
             (x, y, min(side, film.width - x), min(side, film.height - y))
             for y in range(0, film.height, side)
@@ -89,8 +102,9 @@ class Renderer:
         ) * film.samples + sample
         radiance = np.zeros((len(hits), 3))
         if len(hits):
+            slices = {number: self._slice(number, points) for number in self.sliced}
             for light in self.scene.lights:
-                self._add_light(light, points, radiance)
+                self._add_light(light, points, slices, radiance)
             for number, thing in enumerate(self.scene.objects):
                 if thing.dressing is not None and thing.dressing.skies:
                     self._add_skies(thing, np.flatnonzero(points.thing == number), points, radiance)
@@ -119,7 +133,14 @@ class Renderer:
             picture[:, c] += total / self.scene.film.samples
         picture[:, 3] = 1
 
-    def _add_light(self, light, points, radiance):
+    def _slice(self, number, points):
+        """Slices of all look-ups of an object, and the point of each."""
+        thing = self.scene.objects[number]
+        mine = np.flatnonzero(points.thing == number)
+        row, col, _, at_o, _, target = self._look_up(thing, mine, points, points.toward_eye)
+        return LightSlices(self.sliced[number], row, col, at_o), target
+
+    def _add_light(self, light, points, slices, radiance):
         """Add one light's share to the radiance of all points."""
         n = len(points.hits)
         w_i, irradiance = np.empty((n, 3)), np.empty((n, 3))
@@ -140,7 +161,13 @@ class Renderer:
                 lookups = self._look_up(thing, mine, points, w_i)
                 row, col, at_i, at_o, blend, target = lookups
                 values = np.empty_like(at_i)
-                thing.dressing.shader.shade(row, col, at_i, at_o, values)
+                if number in slices:
+                    sliced, belongs = slices[number]
+                    wanted = np.zeros(n, bool)
+                    wanted[mine] = True
+                    sliced.shade(np.flatnonzero(wanted[belongs]), at_i, values)
+                else:
+                    thing.dressing.shader.shade(row, col, at_i, at_o, values)
                 kernels.add_lookups(values, blend, target, irradiance, radiance)
 
     def _add_skies(self, thing, mine, points, radiance):
@@ -243,8 +270,9 @@ def render(scene, *, seed=0, threads=1, on_progress=None):
     tiles = renderer.tiles()
     picture = np.empty((scene.film.height, scene.film.width, len(LAYERS)), np.float32)
     done = zip(tiles, ordered_map(renderer.tile, tiles, threads), strict=True)
-    for number, ((x, y, width, height), pixels) in enumerate(done):
-        picture[y : y + height, x : x + width] = pixels
-        if on_progress:
-            on_progress(number + 1, len(tiles))
+    with single_threaded_blas():
+        for number, ((x, y, width, height), pixels) in enumerate(done):
+            picture[y : y + height, x : x + width] = pixels
+            if on_progress:
+                on_progress(number + 1, len(tiles))
     return picture

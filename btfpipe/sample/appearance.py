@@ -65,7 +65,8 @@ class Appearance:
         `row`, `col` (n,) float32 are texel coordinates, read bilinearly (wrapping if toroidal, else clamped);
         `w_i`, `w_o` (n, 3) float32 are unit vectors in the sample's own frame. The call releases the GIL and may
         run on several threads at once. Between measured lights value / cos(theta_i) is interpolated and
-        multiplied by the true cosine; a light below the horizon gives 0.
+        multiplied by the true cosine; a light below the horizon gives 0. A shader with an attribute `many_lights` that is
+        not None is given so many lights, or more, by way of `LightSlices`.
         """
         raise NotImplementedError
 
