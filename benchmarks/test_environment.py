@@ -1,7 +1,11 @@
-"""Lights that stand for an environment: their error against their number, and the time of a picture under fifty of them."""
+"""Lights that stand for an environment: their error against their number, and the time of a picture under fifty of them.
+
+The errors are also drawn, to .benchmarks/lights.png.
+"""
 
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +56,7 @@ def test_error_against_number_of_lights(benchmark):
 
     directions, solid_angles, radiances = environment.pixels()
     expected = lit(directions, solid_angles[:, None] * radiances)
+    curves = {}
     text = ["lights:    " + "".join(f"{count:>22}" for count in COUNTS)]
     for method in METHODS:
         row = []
@@ -64,17 +69,43 @@ def test_error_against_number_of_lights(benchmark):
                 )
             scale = [(b**2).mean() for b in expected]
             row.append(np.sqrt(np.mean(squares, axis=0) / scale))
+        curves[method] = np.array(row)
         benchmark.extra_info[method] = {n: list(e) for n, e in zip(COUNTS, row, strict=True)}
         text.append(
             f"{method:11}" + "".join(f"{'{:.4f} {:.4f} {:.4f}'.format(*e):>22}" for e in row)
         )
         assert row[-1][0] < 0.3 * row[0][0]
+    _draw(curves, Path(".benchmarks") / "lights.png")
     benchmark.pedantic(environment.lights, (50,), rounds=3)
     sys.stdout.write(
         "\nerror of irradiance, with a half of the sphere shaded, and of a glossy lobe (cos^20)\n"
         + "\n".join(text)
         + f"\nq2tree, 50 lights of {len(directions)} pixels: {1e3 * benchmark.stats.stats.min:.0f} ms\n"
     )
+
+
+def _draw(curves, path):
+    """Draw error against number of lights, a part for each kind of surface and a curve for each method."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.8), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    names = "diffuse, in the open", "diffuse, half the sphere shaded", "glossy lobe, cos$^{20}$"
+    for number, (axes, name) in enumerate(
+        zip(figure.subplots(1, 3, sharey=True), names, strict=True)
+    ):
+        for method, errors in curves.items():
+            axes.plot(COUNTS, 100 * errors[:, number], marker="o", label=method)
+        axes.set(xscale="log", yscale="log", title=name, xlabel="lights")
+        axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
+        axes.minorticks_off()
+        axes.set_yticks([0.1, 1, 10, 100], ["0.1 %", "1 %", "10 %", "100 %"])
+        axes.grid(True, alpha=0.3)
+    figure.axes[0].set_ylabel("root mean square error")
+    figure.axes[0].legend()
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, metadata={"Software": None})
 
 
 def _ring(around=700, across=360):
