@@ -16,6 +16,7 @@ from btfpipe.hashing import uniform
 
 METHODS = ("q2tree", "median-cut", "alias")
 PROJECTIONS = ("latlong", "probe")
+PIXEL_BYTES = 210  # of a map while it is made into lights, as measured
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 _DEPTH = 16  # levels of the quadtree, far finer than any map's pixels
 _QUADS = 12
@@ -191,26 +192,25 @@ class Environment:
         least = _QUADS if method == "q2tree" else 1
         if count < least:
             raise InputError(f"lights: {count}; {method} needs at least {least}.")
-        directions, solid_angles, radiances = self.pixels()
-        power = solid_angles[:, None] * radiances
+        # regions are those of the unturned map, whatever the turn
+        own, solid_angles = (a[self._used] for a in self._grid())
+        power = solid_angles[:, None] * self.values[self._used]
         luminous = (power * _LUMINANCE).sum(axis=1)
         if not luminous.any():
             return np.empty((0, 3)), np.empty((0, 3))
         if method == "alias":
             pixel, times = np.unique(_draw(luminous, count, seed), return_counts=True)
             share = times / count * luminous.sum() / luminous[pixel]
-            return directions[pixel], power[pixel] * share[:, None]
-        # regions are those of the unturned map, whatever the turn
-        regions = _q2tree if method == "q2tree" else _median_cut
-        order, first = regions(self._grid()[0][self._used], luminous, count)
-        power, luminous, directions = power[order], luminous[order], directions[order]
-        mean = np.add.reduceat(luminous[:, None] * directions, first)
+            return _turned(own[pixel], self.turn), power[pixel] * share[:, None]
+        order, first = (_q2tree if method == "q2tree" else _median_cut)(own, luminous, count)
+        power, luminous, own = power[order], luminous[order], own[order]
+        mean = np.add.reduceat(luminous[:, None] * own, first)
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         # a region's light can come from opposite sides alike
-        mean = np.where(length > 0, mean / np.maximum(length, 1e-300), directions[first])
+        mean = np.where(length > 0, mean / np.maximum(length, 1e-300), own[first])
         irradiance = np.add.reduceat(power, first)
         lit = irradiance.any(axis=1)
-        return mean[lit], irradiance[lit]
+        return _turned(mean[lit], self.turn), irradiance[lit]
 
 
 def _turned(directions, turn):

@@ -10,7 +10,7 @@ from btfpipe.errors import InputError
 from btfpipe.rendering import objects
 from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
 from btfpipe.rendering.description import read_description
-from btfpipe.rendering.environment import Environment
+from btfpipe.rendering.environment import PIXEL_BYTES, Environment
 from btfpipe.rendering.renderer import tile_bytes
 from btfpipe.sample import Sample
 
@@ -94,7 +94,8 @@ def load_scene(
     read_picture : callable, optional
         Path to (rows, cols, 3) colours of a picture file, for environment maps.
     memory : int, optional
-        Bytes that the copies of Samples to shade from, and the tiles in work, may take.
+        Bytes that an environment map in work may take, and those that the copies of Samples to shade from and the tiles in work
+        may.
     threads : int
         That will render; each works on a tile.
     seed : int
@@ -107,7 +108,7 @@ def load_scene(
     Raises
     ------
     InputError
-        As `read_description`; if files do not belong together; if Samples take more than `memory`; if the camera is
+        As `read_description`; if files do not belong together; if Samples or a map take more than `memory`; if the camera is
         inside an object.
     """
     description = read_description(path, bindings)
@@ -122,7 +123,7 @@ def load_scene(
             if light["type"] == "environment":
                 files.append(light["map"])
                 try:
-                    environment = _environment(light, read_picture)
+                    environment = _environment(light, read_picture, memory)
                     lights += _stand_for(environment, len(environments), light, seed)
                     if light.get("method") == "harmonics":
                         skies[number] = len(environments), environment, light
@@ -185,11 +186,19 @@ def _light(number, light):
     return Light(True, direction / length, np.array(light["irradiance"], float))
 
 
-def _environment(light, read_picture):
+def _environment(light, read_picture, memory):
     if read_picture is None:
         raise InputError(f"{light['map']}: no reader of pictures at hand; pass load_scene one.")
+    picture = read_picture(light["map"])
+    rows, cols = picture.shape[:2]
+    need = PIXEL_BYTES * rows * cols
+    if memory is not None and need > memory:
+        raise InputError(
+            f"{light['map']}: {cols} x {rows} pixels take {_size(need)} while they are made into lights; --memory"
+            f" allows {_size(memory)}. Pass --memory {math.ceil(need / 2**30)}G, or a smaller map."
+        )
     return Environment(
-        read_picture(light["map"]),
+        picture,
         light.get("projection"),
         intensity=light.get("intensity", 1.0),
         turn=objects.rotation(light),
