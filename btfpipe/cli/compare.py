@@ -171,7 +171,8 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
     with contextlib.ExitStack() as files:  # both appear, or neither
         if out is not None:
             report = {
-                "model": {"file": model.name, "digest": store.digest(model)},
+                "model": {"file": model.name, "digest": store.digest(model)}
+                | ({} if material is None else {"material": material}),
                 "sample": {"file": sample.name, "digest": store.digest(sample)},
                 **facts,
                 "definitions": _DEFINITIONS | {"white": white_is},

@@ -220,7 +220,7 @@ def compress_local_pca(
     resample : bool
         Interpolate samples of other directions or pairs at those of the first, as they are read (see `Resampled`). The error
         of this interpolation comes on top of the Model's own and is not in its figures, which are measured against
-        the resampled pictures; `compare` with the sample itself has both. Such samples are read several times as slowly.
+        the resampled pictures; `compare` with the sample itself has both. Such samples are read two to five times as slowly.
     seed : int
         Of the random starts.
     threads : int
@@ -368,7 +368,9 @@ def _difference(first, sample, name):
         if distance.max() > 1e-6:
             at = int(distance.argmax())
             angle = math.degrees(math.acos(np.clip(np.dot(ours[at], theirs[at]), -1, 1)))
-            return f"other {_PLURALS[table]} than {name}: number {at} differs by {angle:.3g} degrees"
+            return (
+                f"other {_PLURALS[table]} than {name}: number {at} differs by {angle:.3g} degrees"
+            )
     return None
 
 

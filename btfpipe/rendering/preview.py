@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from btfpipe.compression import no_database, open_appearance
 from btfpipe.errors import InputError
 from btfpipe.sample.transfer import encode
 
@@ -256,7 +257,9 @@ def _starts_like_ours(path):
         return file.read(2) == b"PK"
 
 
-def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False, material=None):
+def preview(
+    paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False, material=None
+):
     """Display picture (rows, cols, 3) uint8 of rendered pictures, or of one Sample or Model.
 
     Parameters
@@ -286,8 +289,6 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
     """
     paths = [Path(p) for p in paths]
     archives = [p for p in paths if _starts_like_ours(p)]
-    from btfpipe.compression import no_database, open_appearance
-
     if material is not None and not archives:
         raise no_database(paths[0])
     if archives:

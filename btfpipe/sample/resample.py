@@ -85,6 +85,8 @@ def _weights(source, target, interpolation):
     share = np.empty(pair.shape, np.float32)
     for part, found, shares in weights.blocks(w_i, w_o):
         pair[part], share[part] = found, shares
+    # at a direction of the source the other shares are rounding: their pictures need not be read
+    share[np.abs(share) < 1e-7 * share.max(axis=1, keepdims=True)] = 0
     # sums are taken in this order, however the pairs are cut into blocks
     order = np.argsort(pair, axis=1, kind="stable")
     return np.take_along_axis(pair, order, 1), np.take_along_axis(share, order, 1)

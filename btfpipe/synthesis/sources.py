@@ -9,7 +9,9 @@ from btfpipe.errors import InputError
 _DIMENSIONS = 16  # of the appearance of a BTF's texel that plain features keep
 
 
-def read_features(path, k, levels, *, toroidal=False, material=None, seed=0, threads=1, memory=2 << 30):
+def read_features(
+    path, k, levels, *, toroidal=False, material=None, seed=0, threads=1, memory=2 << 30
+):
     """Features of a file, with neighbour lists of at least `k`.
 
     A Features file is taken as it is, lists are added only if it has none. An ``.npy`` array (rows, cols, d) and a picture are plain
