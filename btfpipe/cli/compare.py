@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import flag, input_file, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
 
 _WAYS = ("barycentric", "four", "nearest")
 _DEFINITIONS = {
@@ -43,8 +43,9 @@ _DEFINITIONS = {
     type=click.Path(path_type=Path, dir_okay=False),
     help="Picture to write: errors over all pairs; the best, middle and worst picture.",
 )
+@material_option
 @stage(out="optional", outputs=("picture",))
-def compare(files, sweep, ways, picture, out, seed, threads, memory, quiet):
+def compare(files, sweep, ways, picture, material, out, seed, threads, memory, quiet):
     """Measure how far MODEL (a Model or a Sample) is from SAMPLE, at all of SAMPLE's direction pairs.
 
     Writes a report in JSON: RMSE, PSNR, relative error and SSIM, overall and for each pair; bytes and their ratio.
@@ -62,11 +63,13 @@ def compare(files, sweep, ways, picture, out, seed, threads, memory, quiet):
     if len(files) != (1 if sweep else 2):
         raise click.UsageError(f"{len(files)} files are given; expected {wanted}.")
     if not sweep:
-        return _compare(*files, ways, picture, out, threads, quiet)
+        return _compare(*files, material, ways, picture, out, threads, quiet)
     if ways:
         raise click.UsageError(
             "--sweep measures at the sample's own pairs; leave --interpolation out."
         )
+    if material is not None:
+        raise click.UsageError("--sweep makes its own Models; leave --material out.")
     return _sweep(files[0], picture, out, seed, threads, memory, quiet)
 
 
@@ -102,7 +105,10 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
         for row in rows:
-            options = " ".join(f"{flag(name)} {value}" for name, value in row["options"].items())
+            options = " ".join(
+                f"{flag(name)} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
+                for name, value in row["options"].items()
+            )
             what = row.get("skipped") or (
                 f"{row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
                 f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s"
@@ -120,7 +126,7 @@ def _encoded(png, picture):
     return encode_picture(read_picture(png)[..., :3], picture.suffix.lower())
 
 
-def _compare(model, sample, ways, picture, out, threads, quiet):
+def _compare(model, sample, material, ways, picture, out, threads, quiet):
     """Compare a Model with a Sample: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression import open_appearance
@@ -128,7 +134,7 @@ def _compare(model, sample, ways, picture, out, threads, quiet):
     from btfpipe.sample import Sample
 
     reference = Sample.open(sample)
-    stand_in = open_appearance(model)
+    stand_in = open_appearance(model, material)
     ways = _WAYS if "all" in ways else tuple(dict.fromkeys(ways))
     if not ways:
         ways = (None,) if comparison.matching_pairs(stand_in, reference) is not None else _WAYS[:1]
@@ -165,7 +171,8 @@ def _compare(model, sample, ways, picture, out, threads, quiet):
     with contextlib.ExitStack() as files:  # both appear, or neither
         if out is not None:
             report = {
-                "model": {"file": model.name, "digest": store.digest(model)},
+                "model": {"file": model.name, "digest": store.digest(model)}
+                | ({} if material is None else {"material": material}),
                 "sample": {"file": sample.name, "digest": store.digest(sample)},
                 **facts,
                 "definitions": _DEFINITIONS | {"white": white_is},

@@ -73,6 +73,11 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
     type=click.IntRange(min=0),
     help="Power iterations of svd; by default as many as the error needs.",
 )
+@click.option(
+    "--resample",
+    is_flag=True,
+    help="Interpolate samples of other directions than the first at its directions, for a database.",
+)
 @stage()
 def compress(samples, method, out, seed, threads, memory, quiet, **options):
     """Make a Model that stands for a Sample, in a fraction of its bytes.
@@ -91,6 +96,7 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
     from btfpipe.metrics import raw_bytes
     from btfpipe.sample import Sample
 
+    options["resample"] = options["resample"] or None  # as the others: None if not given
     if options["space"] is not None:
         options["space"] = _SPACES[options["space"]]
     apart = options["space"] is not None or options["channel_components"] is not None
@@ -110,6 +116,8 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
             f"method {method} takes one sample; {len(samples)} are given. Methods that make a database of several:"
             f" {', '.join(DATABASES)}."
         )
+    if options["resample"] and len(samples) == 1:
+        raise click.UsageError("--resample is for a database of several samples; 1 is given.")
     opened = [Sample.open(path) for path in samples]
     names = _names(samples) if len(samples) > 1 else None
     with naming(samples[0]), progress("compress: pictures read", quiet) as report:

@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import flag, input_file, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
 
 # As in btfpipe.formats.targets, which is not imported for --help.
 _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
@@ -33,10 +33,11 @@ _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
     metavar="Y U V",
     help="Terms of luminance and of each chroma of a .btf; a Model of method factored is written as it is.  [default: 32 16 16]",
 )
+@material_option
 @stage(folder=True)
 def export(
-    source, format_, suffix, sample_number, channel_components, out, seed, threads, memory, quiet
-):
+    source, format_, suffix, sample_number, channel_components, material, out, seed, threads, memory, quiet
+):  # fmt: skip
     """Write SOURCE, a Sample or a Model, in a format that other programs read.
 
     Sets of pictures become a zip if the name ends in .zip, else a folder: ubo (Bonn's layout), utia, pairs (any pairs, with a CSV
@@ -63,7 +64,7 @@ def export(
             raise click.UsageError(f"{flag(name)} is not for {format_}.")
     if format_ == "btf":  # factorised on the way
         options |= {"seed": seed, "memory": memory}
-    appearance = open_appearance(source)
+    appearance = open_appearance(source, material)
     with naming(source), progress("export: pictures", quiet) as report:
         facts = targets.write(
             out, format_, appearance, threads=threads, on_progress=report, **options

@@ -46,6 +46,11 @@ def _lines(thing, depth):
             else:
                 yield f"{indent}{name}:"
                 yield from _lines(value, depth + 1)
+        elif isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
+            yield f"{indent}{name}:"
+            for number, item in enumerate(value):
+                rest = {k: v for k, v in item.items() if k != "name"}
+                yield from _lines({item.get("name", number): rest}, depth + 1)
         elif isinstance(value, dict) and value:
             yield f"{indent}{name}:"
             yield from _lines(value, depth + 1)

@@ -233,6 +233,15 @@ def input_file(**kwargs):
     return click.Path(exists=True, path_type=Path, **kwargs)
 
 
+def material_option(command):
+    """``--material`` of a command that evaluates a Model, for `open_appearance`."""
+    return click.option(
+        "--material",
+        metavar="NAME|NUMBER",
+        help="Which material of a database to take, by name or number from 0.  [default: the first]",
+    )(command)
+
+
 def flag(name):
     """An option as it is typed, from its name in Python."""
     return "--" + name.replace("_", "-")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, stage
+from btfpipe.cli.options import input_file, material_option, stage
 from btfpipe.errors import InputError
 
 
@@ -39,8 +39,9 @@ def _not_nan(context, parameter, value):
 @click.option(
     "--labels", is_flag=True, help="Write file names, or directions in degrees, below the pictures."
 )
+@material_option
 @stage()
-def preview(files, columns, exposure, filmic, layer, labels, out):
+def preview(files, columns, exposure, filmic, layer, labels, material, out):
     """Tone-map rendered pictures into one PNG, or show a Sample or Model under many lights and views.
 
     Several pictures make a contact sheet with one exposure for all; of a Sample or Model the sheet has views
@@ -58,7 +59,13 @@ def preview(files, columns, exposure, filmic, layer, labels, out):
     if Path(out).suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"{out}: previews are PNG or JPEG; end the name in .png or .jpg.")
     picture, stops = make_preview(
-        files, columns=columns, exposure=exposure, filmic=filmic, layer=layer, labels=labels
+        files,
+        columns=columns,
+        exposure=exposure,
+        filmic=filmic,
+        layer=layer,
+        labels=labels,
+        material=material,
     )
     write_picture(out, picture)
     return {

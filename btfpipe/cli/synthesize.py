@@ -4,7 +4,7 @@ import math
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, input_file, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, input_file, material_option, naming, progress, stage
 
 _MOST_TEXELS = 16384  # a side
 
@@ -101,10 +101,11 @@ class _Plane(click.ParamType):
     is_flag=True,
     help="An array or picture given as FEATURES continues at its opposite borders.",
 )
+@material_option
 @stage()
 def synthesize(
     features, surface, plane, search, k, levels, texels_per_unit, repeats, turn_deg, coherence, sweeps, distance,
-    toroidal, out, seed, threads, memory, quiet,
+    toroidal, material, out, seed, threads, memory, quiet,
 ):  # fmt: skip
     """Grow a Sample over a Surface, or over a plane (Tong et al. 2002).
 
@@ -133,7 +134,8 @@ def synthesize(
     target = None if plane else Surface.open(surface)
     with naming(features):
         sample = read_features(
-            features, None if full else k, levels, toroidal=toroidal, seed=seed, threads=threads, memory=memory
+            features, None if full else k, levels, toroidal=toroidal, material=material, seed=seed, threads=threads,
+            memory=memory,
         )  # fmt: skip
     common = {
         "full": full, "k": k, "levels": levels, "sweeps": sweeps, "coherence": coherence, "seed": seed,

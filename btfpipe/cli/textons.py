@@ -2,7 +2,7 @@
 
 import click
 
-from btfpipe.cli.options import input_file, naming, progress, stage
+from btfpipe.cli.options import input_file, material_option, naming, progress, stage
 
 
 @click.command()
@@ -52,9 +52,11 @@ from btfpipe.cli.options import input_file, naming, progress, stage
     show_default=True,
     help="Length of the neighbour lists, the texel itself included; the most that synthesis can use.",
 )
+@material_option
 @stage()
 def textons(
-    source, levels, n_textons, images, neighbourhood, coarse_neighbourhood, k, out, seed, threads, memory, quiet
+    source, levels, n_textons, images, neighbourhood, coarse_neighbourhood, k, material, out, seed, threads, memory,
+    quiet,
 ):  # fmt: skip
     """Extract surface textons and neighbour lists (Tong et al. 2002).
 
@@ -69,7 +71,7 @@ def textons(
     from btfpipe.analysis.textons import texton_features
     from btfpipe.compression import open_appearance
 
-    appearance = open_appearance(source)
+    appearance = open_appearance(source, material)
     with naming(source), progress("textons", quiet) as report:
         features = texton_features(
             appearance,
@@ -86,5 +88,7 @@ def textons(
         )
     facts = dict(features.about)
     features.about |= {"sample_digest": store.digest(source), "source": source.name, "seed": seed}
+    if material is not None:
+        features.about["material"] = material
     features.save(out)
     return {"inputs": [source], **facts, "bytes": out.stat().st_size}

@@ -46,6 +46,7 @@ METHODS = {
             "clusters": "clusters",
             "target_bytes": "target_bytes",
             "precision": "precision",
+            "resample": "resample",
         },
     ),
     "harmonics": Method(
@@ -65,8 +66,43 @@ METHODS = {
 DATABASES = ("local-pca",)  # methods that take several samples at once
 
 
-def open_appearance(path):
-    """Open a Sample or a Model of any method."""
+def open_appearance(path, material=None):
+    """Open a Sample or a Model of any method.
+
+    Parameters
+    ----------
+    path : path-like
+    material : str or int, optional
+        Which material of a database to evaluate: its name, or its number from 0 (in digits, too). By default the one that
+        the file is set to, which is the first.
+
+    Raises
+    ------
+    InputError
+        If the file is neither, is damaged, or a material is asked for that it does not hold.
+    """
+    appearance = _open(path)
+    if material is None:
+        return appearance
+    if not hasattr(appearance, "materials"):
+        raise no_database(path)
+    if material not in appearance.materials and str(material).isdecimal():
+        material = int(material)
+    try:
+        return appearance.material(material)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def no_database(path):
+    """The error for a file that a material is asked of and that has none to choose from."""
+    return InputError(
+        f"{path}: not a database, so it has no materials to choose from; leave the material out, or give a Model of several"
+        f" samples ({', '.join(DATABASES)})."
+    )
+
+
+def _open(path):
     reader = store.read(path, ("sample", "model"))
     if reader.kind == "sample":
         return Sample.from_reader(reader)
@@ -119,4 +155,4 @@ def compress(
     )  # fmt: skip
 
 
-__all__ = ["DATABASES", "METHODS", "compress", "open_appearance"]
+__all__ = ["DATABASES", "METHODS", "compress", "no_database", "open_appearance"]

@@ -17,6 +17,7 @@ from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import compress_svd
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, single_threaded_blas
+from btfpipe.sample.resample import Resampled
 
 # Of the pictures' 3 bytes a texel and pair, by default one in so many is spent: with 8 components in half precision
 # this gives 16 clusters to a sample of 128 x 128 texels and 81 x 81 directions, and 250 to fifteen with 151 x 151,
@@ -43,7 +44,7 @@ class LocalPcaModel(Model):
     labels : (texels of all materials,) unsigned int
         Cluster of each texel, material by material, row by row.
     materials : list of dict
-        ``name``, ``shape``, ``toroidal``, ``texels_per_mm``, ``absolute`` of each.
+        ``name``, ``shape``, ``toroidal``, ``texels_per_mm``, ``absolute`` of each; ``resampled_from`` if it was.
     source : Appearance
         Gives directions and index tables.
     about : dict, optional
@@ -191,6 +192,7 @@ def compress_local_pca(
     target_bytes=None,
     precision="half",
     names=None,
+    resample=False,
     seed=0,
     threads=1,
     memory=2 << 30,
@@ -201,7 +203,7 @@ def compress_local_pca(
     Parameters
     ----------
     samples : Appearance or sequence of Appearances
-        Of the same directions and pairs; sizes may differ. Read in blocks of pictures, some six times.
+        Of the same directions and pairs unless `resample`; sizes may differ. Read in blocks of pictures, some six times.
     clusters : int, optional
         By default as many as `target_bytes` holds.
     components : int
@@ -215,6 +217,10 @@ def compress_local_pca(
         coordinates in half precision.
     names : sequence of str, optional
         Of the materials; by default ``material 0`` and so on.
+    resample : bool
+        Interpolate samples of other directions or pairs at those of the first, as they are read (see `Resampled`). The error
+        of this interpolation comes on top of the Model's own and is not in its figures, which are measured against
+        the resampled pictures; `compare` with the sample itself has both. Such samples are read two to five times as slowly.
     seed : int
         Of the random starts.
     threads : int
@@ -228,7 +234,8 @@ def compress_local_pca(
     -------
     LocalPcaModel
         Evaluates the first material. Its ``about`` holds `n_clusters`, `n_terms`, `precision`, `warnings` (sentences),
-        `materials` (with `rmse` and `relative_error` of each), and over all materials `rmse` and `relative_error`,
+        `materials` (with `rmse` and `relative_error` of each, and `resampled_from`, the numbers of lights, views and
+        pairs, of those that were), and over all materials `rmse` and `relative_error`,
         measured on the numbers as stored and over all linear values.
 
     Raises
@@ -249,7 +256,7 @@ def compress_local_pca(
         raise InputError(f"precision {precision!r}; expected half, single or byte.")
     if components < 1:
         raise InputError(f"{components} components asked for; expected at least 1.")
-    _require_equal_directions(samples, names)
+    resampled = _resample(samples, names, resample)
     pairs = samples[0].n_pairs
     clusters = _cluster_count(samples, clusters, components, target_bytes, precision)
     planned = plan(samples, clusters, components, precision, threads, memory)
@@ -281,6 +288,7 @@ def compress_local_pca(
             "toroidal": bool(sample.toroidal),
             "texels_per_mm": sample.texels_per_mm,
             "absolute": bool(getattr(sample, "absolute", False)),
+            **({"resampled_from": resampled[name]} if name in resampled else {}),
         }
         for name, sample in zip(names, samples, strict=True)
     ]
@@ -316,26 +324,54 @@ def _overall(materials):
     }
 
 
-def _require_equal_directions(samples, names):
-    """Refuse samples of different directions, naming the sample and what differs."""
-    first = samples[0]
-    for sample, name in zip(samples[1:], names[1:], strict=True):
-        for table in _DIRECTIONS:
-            ours, theirs = getattr(first, table), getattr(sample, table)
-            if len(ours) != len(theirs):
-                what = f"{len(theirs)} {_PLURALS[table]}, {names[0]} has {len(ours)}"
-            elif table.endswith("index") and (ours != theirs).any():
-                what = f"the same directions as {names[0]}, but pairs them in another order"
-            elif not table.endswith("index") and np.abs(ours - theirs).max() > 1e-6:
-                at = int(np.abs(ours - theirs).max(axis=1).argmax())
-                angle = math.degrees(math.acos(np.clip(np.dot(ours[at], theirs[at]), -1, 1)))
-                what = f"other {_PLURALS[table]} than {names[0]}: number {at} differs by {angle:.3g} degrees"
-            else:
-                continue
+def _resample(samples, names, allowed):
+    """Put samples of other directions than the first in place at its directions, or refuse them by name.
+
+    Returns
+    -------
+    dict
+        By name of those samples, how many lights, views and pairs they have.
+    """
+    first, resampled = samples[0], {}
+    for number, (sample, name) in enumerate(zip(samples, names, strict=True)):
+        difference = _difference(first, sample, names[0])
+        if difference is None:
+            continue
+        if not allowed:
             raise InputError(
-                f"a database needs samples of equal directions; {name} has {what}."
-                " Compress them apart, or resample one to the other's directions."
+                f"a database needs samples of equal directions; {name} has {difference}."
+                " Compress them apart, or pass --resample."
             )
+        try:
+            samples[number] = Resampled(sample, first)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+        resampled[name] = {
+            "lights": len(sample.light_directions),
+            "views": len(sample.view_directions),
+            "pairs": sample.n_pairs,
+        }
+    return resampled
+
+
+def _difference(first, sample, name):
+    """What tells the directions and pairs of a sample from those of the first, which has the name; None: nothing."""
+    for table in _DIRECTIONS:
+        ours, theirs = getattr(first, table), getattr(sample, table)
+        if len(ours) != len(theirs):
+            return f"{len(theirs)} {_PLURALS[table]}, {name} has {len(ours)}"
+        if table.endswith("index"):
+            if (ours != theirs).any():
+                return f"the same directions as {name}, but pairs them in another order"
+            continue
+        distance = np.abs(ours - theirs).max(axis=1)
+        if distance.max() > 1e-6:
+            at = int(distance.argmax())
+            angle = math.degrees(math.acos(np.clip(np.dot(ours[at], theirs[at]), -1, 1)))
+            return (
+                f"other {_PLURALS[table]} than {name}: number {at} differs by {angle:.3g} degrees"
+            )
+    return None
 
 
 _PLURALS = {

@@ -14,13 +14,15 @@ from btfpipe.metrics.comparison import compare
 SETTINGS = {
     "coded": [{"ratio": ratio} for ratio in (400.0, 200.0, 100.0, 50.0, 25.0)],
     "svd": [{"components": n} for n in (4, 8, 16, 32, 64, 128)],
+    # of logarithms, the default; about as large as an SVD of as many terms as luminance has
+    "factored": [{"channel_components": (n, n // 2, n // 2)} for n in (4, 8, 16, 32, 64, 128)],
     "view-pca": [{"components": n} for n in (1, 2, 5, 10, 20)],
     "local-pca": [{"clusters": n, "components": 8} for n in (1, 2, 4, 8, 16)],
     "harmonics": [
         {"view_harmonics": v, "light_harmonics": n} for v, n in ((9, 9), (16, 16), (25, 25), (36, 25))
     ],
 }  # fmt: skip
-_MARKS = {"svd": "o", "view-pca": "s", "local-pca": "^", "harmonics": "D"}
+_MARKS = {"svd": "o", "view-pca": "s", "local-pca": "^", "harmonics": "D", "factored": "v"}
 
 
 def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progress=None):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from btfpipe.compression import no_database, open_appearance
 from btfpipe.errors import InputError
 from btfpipe.sample.transfer import encode
 
@@ -256,7 +257,9 @@ def _starts_like_ours(path):
         return file.read(2) == b"PK"
 
 
-def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False):
+def preview(
+    paths, *, columns=None, exposure=None, filmic=False, layer="colour", labels=False, material=None
+):
     """Display picture (rows, cols, 3) uint8 of rendered pictures, or of one Sample or Model.
 
     Parameters
@@ -270,6 +273,8 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
         One of `LAYERS`.
     labels : bool
         Write names, or directions in degrees, below the pictures.
+    material : str or int, optional
+        Of a database; see `btfpipe.compression.open_appearance`.
 
     Returns
     -------
@@ -280,20 +285,20 @@ def preview(paths, *, columns=None, exposure=None, filmic=False, layer="colour",
     Raises
     ------
     InputError
-        If a file is neither a picture nor a Sample or Model, or lacks the layer.
+        If a file is neither a picture nor a Sample or Model, or lacks the layer or the material.
     """
     paths = [Path(p) for p in paths]
     archives = [p for p in paths if _starts_like_ours(p)]
+    if material is not None and not archives:
+        raise no_database(paths[0])
     if archives:
-        from btfpipe.compression import open_appearance
-
         if len(paths) > 1:
             raise InputError(
                 f"{archives[0]}: a sheet shows several pictures or one Sample or Model; give it alone."
             )
         if layer != "colour":
             raise InputError(f"{paths[0]}: a Sample or Model has no layer {layer}.")
-        linear, names, columns_found = sample_sheet(open_appearance(paths[0]))
+        linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
         columns = columns or columns_found
     else:
         channels = [read_channels(p) for p in paths]

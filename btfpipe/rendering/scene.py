@@ -258,10 +258,10 @@ def _thing(entry, opened, read_mesh, room):
     from btfpipe.surface import Surface
     from btfpipe.synthesis import CoordinateMap
 
-    def open_once(opener, file):
-        key = (opener, file)
+    def open_once(opener, file, *which):
+        key = (opener, file, *which)
         if key not in opened:
-            opened[key] = opener(file)
+            opened[key] = opener(file, *which)
             if room is not None:
                 _require_room(file, opened, room)
         return opened[key]
@@ -278,7 +278,7 @@ def _thing(entry, opened, read_mesh, room):
                 f"{entry['map']}: made for surface {belongs}; {entry['surface']} is {surface.digest}. Run"
                 " `btfpipe synthesize` on this surface, or name the other."
             )
-        appearance = _material(open_once(open_appearance, entry["model"]), entry)
+        appearance = open_once(open_appearance, entry["model"], entry.get("material"))
         return objects.dressed_surface(
             surface.levels[0], coordinates, appearance, interpolation, entry["map"]
         )
@@ -290,7 +290,7 @@ def _thing(entry, opened, read_mesh, room):
                 raise InputError(f"{entry['map']}: a map over a surface; this object is a plane.")
         return objects.patch(
             entry["plane"],
-            _material(open_once(open_appearance, entry["model"]), entry),
+            open_once(open_appearance, entry["model"], entry.get("material")),
             interpolation,
             coordinates=coordinates,
             texels_per_unit=entry.get("texels_per_unit"),
@@ -300,19 +300,6 @@ def _thing(entry, opened, read_mesh, room):
     if "plane" in entry:
         return objects.flat(entry["plane"], entry["albedo"])
     return objects.diffuse_mesh(entry["mesh"], entry["albedo"], read_mesh)
-
-
-def _material(appearance, entry):
-    """The material that an object names of a database, or the appearance itself."""
-    name = entry.get("material")
-    if name is None:
-        return appearance
-    names = list(getattr(appearance, "materials", []))
-    if name not in names:
-        raise InputError(
-            f"material {name!r} is not in {entry['model']}, which holds {', '.join(names) or 'one without a name'}."
-        )
-    return appearance.material(name)
 
 
 def _ground(entry, points, up):

@@ -183,7 +183,7 @@ class PairWeights:
         )
 
     def blocks(self, w_i, w_o):
-        """Yield (slice, pair, share) over blocks of queries (m, 3) float32, unit vectors in the sample's frame.
+        """Yield (slice, pair, share) over blocks of queries (m, 3), unit vectors in the sample's frame, float32 or float64.
 
         `pair` (n, `most`) int32 and `share` of the same shape, float32, are used again for the next block; blocks
         keep them in the processor's cache. Between lights value / cos(theta_i) is interpolated and multiplied by

@@ -9,7 +9,9 @@ from btfpipe.errors import InputError
 _DIMENSIONS = 16  # of the appearance of a BTF's texel that plain features keep
 
 
-def read_features(path, k, levels, *, toroidal=False, seed=0, threads=1, memory=2 << 30):
+def read_features(
+    path, k, levels, *, toroidal=False, material=None, seed=0, threads=1, memory=2 << 30
+):
     """Features of a file, with neighbour lists of at least `k`.
 
     A Features file is taken as it is, lists are added only if it has none. An ``.npy`` array (rows, cols, d) and a picture are plain
@@ -25,6 +27,8 @@ def read_features(path, k, levels, *, toroidal=False, seed=0, threads=1, memory=
         Levels to make; a Features file keeps its own.
     toroidal : bool
         Whether an array or a picture continues at its opposite border; the other files say so themselves.
+    material : str or int, optional
+        Of a Model that is a database; see `btfpipe.compression.open_appearance`.
     seed, threads, memory
         For the SVD of a Sample, and for the lists.
 
@@ -40,14 +44,17 @@ def read_features(path, k, levels, *, toroidal=False, seed=0, threads=1, memory=
     from btfpipe.analysis.features import Features
     from btfpipe.analysis.neighbours import add_neighbour_lists
     from btfpipe.analysis.pyramid import plain_features
+    from btfpipe.compression import no_database
 
     path = Path(path)
     kind = _kind(path)
+    if material is not None and kind not in ("sample", "model"):
+        raise no_database(path)
     if kind == "features":
         features = Features.open(path)
     else:
         if kind in ("sample", "model"):
-            image, toroidal = _appearance_image(path, seed, threads, memory)
+            image, toroidal = _appearance_image(path, material, seed, threads, memory)
         elif kind is not None:
             raise InputError(
                 f"{path}: holds a {kind}; expected features, a sample, a model, an array or a picture."
@@ -84,12 +91,12 @@ def _kind(path):
     return store.read(path).kind if zipfile.is_zipfile(path) or is_zip(path) else None
 
 
-def _appearance_image(path, seed, threads, memory):
+def _appearance_image(path, material, seed, threads, memory):
     from btfpipe.analysis.textons import eigen_textures, picture_weights
     from btfpipe.compression import open_appearance
     from btfpipe.parallel import single_threaded_blas
 
-    appearance = open_appearance(path)
+    appearance = open_appearance(path, material)
     textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
     with single_threaded_blas():
         image = textures @ picture_weights(angular)[:, :_DIMENSIONS]

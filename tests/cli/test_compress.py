@@ -7,6 +7,7 @@ import pytest
 
 from btfpipe.compression import open_appearance
 from btfpipe.compression.svd import SvdModel, compress_svd
+from btfpipe.directions import bonn81
 from btfpipe.sample import Sample
 
 SVD = ("--method", "svd")
@@ -185,6 +186,39 @@ def test_several_samples_make_a_database(btfpipe, make_sample, tmp_path):
         values = Sample.open(path).pictures(slice(None))
         error = model.material(number).pictures(slice(None)) - values
         assert np.sqrt((error**2).mean()) < 0.1 * values.std()
+
+
+def test_a_database_of_other_directions_is_refused_or_resampled(btfpipe, make_sample, tmp_path):
+    files = tmp_path / "wool.npz", tmp_path / "felt.npz"
+    make_sample().save(files[0])
+    make_sample(8, 9, seed=2, lights=bonn81()[:37], views=bonn81()[:19]).save(files[1])
+    out = tmp_path / "m.npz"
+    ask = ("compress", *files, "-o", out, "--method", "local-pca", "--clusters", 8)
+    done = btfpipe(*ask, code=3)
+    assert "felt has 37 lights, wool has 19" in done.stderr
+    assert done.stderr.endswith("or pass --resample.\n")
+    assert not out.exists()
+    facts = json.loads(btfpipe(*ask, "--resample", "--json").stdout)
+    wool, felt = facts["materials"]
+    assert "resampled_from" not in wool
+    assert felt["resampled_from"] == {"lights": 37, "views": 19, "pairs": 703}
+    assert "resampled from: lights 37" in btfpipe("info", out).stdout.replace("_", " ")
+    # the sample's own first directions are the database's: there nothing is interpolated
+    sample, model = Sample.open(files[1]), open_appearance(out, "felt")
+    values = sample.pictures([37 * 3 + 5])[0]
+    error = model.pictures([19 * 3 + 5])[0] - values
+    assert np.sqrt((error**2).mean()) < 0.1 * values.std()
+
+
+def test_resampling_is_for_databases_of_several(btfpipe, sample_file, tmp_path):
+    for options, message in (
+        ((), "method coded has no --resample"),
+        (("--method", "local-pca"), "--resample is for a database of several samples; 1 is given"),
+    ):
+        done = btfpipe(
+            "compress", sample_file, "-o", tmp_path / "m.npz", "--resample", *options, code=2
+        )
+        assert message in done.stderr
 
 
 def test_several_samples_are_refused_by_a_method_that_takes_one(btfpipe, sample_file, tmp_path):

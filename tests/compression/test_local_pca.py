@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from btfpipe.compression import open_appearance
+from btfpipe.compression import compress, open_appearance
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_pca import LocalPcaModel, compress_local_pca
 from btfpipe.directions import Hemisphere, bonn81, from_angles
 from btfpipe.errors import InputError
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample, light_cosines
+from btfpipe.sample.resample import Resampled
 
 
 @pytest.fixture(autouse=True)
@@ -202,6 +203,12 @@ def test_a_database_goes_through_its_file(patchy_sample, tmp_path):
     assert open_appearance(tmp_path / "felt_first.npz").shape == (5, 6)
     stored = sum(array.nbytes for array in (back.bases, back.coordinates, back.labels))
     assert stored <= back.nbytes <= (tmp_path / "m.npz").stat().st_size
+    for which in (1, "1", "felt"):
+        assert open_appearance(tmp_path / "m.npz", which).shape == (5, 6)
+    with pytest.raises(
+        InputError, match=r"m\.npz: no material 2; the database holds 2: wool, felt"
+    ):
+        open_appearance(tmp_path / "m.npz", "2")
     for which in ("silk", 2, -1):
         with pytest.raises(
             InputError, match=f"no material {which!r}; the database holds 2: wool, felt"
@@ -368,7 +375,9 @@ def test_a_list_of_pairs_is_compressed_and_shaded(patchy_sample):
 
 def test_databases_of_different_directions_are_refused_by_name(patchy_sample):
     wool, felt = patchy_sample(), patchy_sample(n_lights=10)
-    with pytest.raises(InputError, match=r"felt has 10 lights, wool has 11.*Compress them apart"):
+    with pytest.raises(
+        InputError, match=r"felt has 10 lights, wool has 11.*apart, or pass --resample\.$"
+    ):
         compress_local_pca([wool, felt], names=["wool", "felt"])
     felt = patchy_sample()
     felt.view_directions[2] = from_angles(np.array([0.3]), np.array([1.0]))[0]
@@ -380,6 +389,48 @@ def test_databases_of_different_directions_are_refused_by_name(patchy_sample):
         InputError, match="material 1 has the same directions as material 0, but pairs"
     ):
         compress_local_pca([wool, felt])
+
+
+def test_a_resampled_material_is_measured_against_its_resampled_pictures(patchy_sample):
+    """The database is that of the resampled pictures written out, to the last byte; of one order, whatever the threads."""
+    wool = patchy_sample()
+    felt = patchy_sample(shape=(6, 9), n_lights=19, n_views=7, toroidal=True)
+    jute = patchy_sample(shape=(5, 5))
+    names = ["wool", "felt", "jute"]
+    pictures = Resampled(felt, wool).pictures(slice(None))
+    written = Sample(
+        pictures, wool.light_directions, wool.view_directions, wool.light_index, wool.view_index,
+        toroidal=True,
+    )  # fmt: skip
+    options = {"clusters": 5, "components": 3, "names": names}
+    expected = compress_local_pca([wool, written, jute], **options)
+    for threads in (1, 3):
+        found = compress([wool, felt, jute], "local-pca", resample=True, threads=threads, **options)
+        for name, array in found.arrays().items():
+            assert array.tobytes() == expected.arrays()[name].tobytes(), name
+    error = matrix(found.material("felt")) - matrix(written)
+    facts = found.about["materials"]
+    assert facts[1].pop("resampled_from") == {"lights": 19, "views": 7, "pairs": 133}
+    assert facts == expected.about["materials"]
+    assert facts[1]["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-5)
+
+
+def test_samples_of_other_pairs_are_resampled_or_cannot_be(patchy_sample):
+    wool, felt = patchy_sample(shape=(4, 5)), patchy_sample(shape=(4, 5), n_lights=4)
+    some = np.array([5, 39, 7, 20, 21, 22, 30])
+    few = Sample(
+        wool.codes[some], wool.light_directions, wool.view_directions, wool.light_index[some],
+        wool.view_index[some],
+    )  # fmt: skip
+    for first, other in ((few, felt), (felt, few)):
+        database = compress_local_pca(
+            [first, other], clusters=40, precision="single", resample=True
+        )
+        expected = Resampled(other, first).pictures(slice(None))
+        np.testing.assert_allclose(database.material(1).pictures(slice(None)), expected, atol=1e-5)
+    felt.view_directions[2] *= -1
+    with pytest.raises(InputError, match=r"^felt: direction 2 points below the surface"):
+        compress_local_pca([wool, felt], names=["wool", "felt"], resample=True)
 
 
 def test_bad_input_is_refused_by_name(patchy_sample):
