@@ -81,7 +81,19 @@ def open_appearance(path, material=None):
     InputError
         If the file is neither, is damaged, or a material is asked for that it does not hold.
     """
-    appearance = _open(path)
+    reader = store.read(path, ("sample", "model"))
+    if reader.kind == "sample":
+        return choose_material(Sample.from_reader(reader), material, path)
+    name = reader.about.get("method")
+    if name not in METHODS:
+        raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
+    method = METHODS[name]
+    model = getattr(importlib.import_module(method.module), method.model).from_reader(reader)
+    return choose_material(model, material, path)
+
+
+def choose_material(appearance, material, path):
+    """One material of a database opened before, whose memory it shares; see `open_appearance`."""
     if material is None:
         return appearance
     if not hasattr(appearance, "materials"):
@@ -100,17 +112,6 @@ def no_database(path):
         f"{path}: not a database, so it has no materials to choose from; leave the material out, or give a Model of several"
         f" samples ({', '.join(DATABASES)})."
     )
-
-
-def _open(path):
-    reader = store.read(path, ("sample", "model"))
-    if reader.kind == "sample":
-        return Sample.from_reader(reader)
-    name = reader.about.get("method")
-    if name not in METHODS:
-        raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
-    method = METHODS[name]
-    return getattr(importlib.import_module(method.module), method.model).from_reader(reader)
 
 
 def compress(
@@ -155,4 +156,11 @@ def compress(
     )  # fmt: skip
 
 
-__all__ = ["DATABASES", "METHODS", "compress", "no_database", "open_appearance"]
+__all__ = [
+    "DATABASES",
+    "METHODS",
+    "choose_material",
+    "compress",
+    "no_database",
+    "open_appearance",
+]

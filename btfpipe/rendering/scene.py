@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from btfpipe.compression import open_appearance
+from btfpipe.compression import choose_material, open_appearance
 from btfpipe.errors import InputError
 from btfpipe.rendering import objects
 from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
@@ -249,6 +249,10 @@ def _require_room(path, opened, room):
         )
 
 
+def _material(appearance, entry):
+    return choose_material(appearance, entry.get("material"), entry["model"])
+
+
 def _size(count):
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
@@ -258,10 +262,10 @@ def _thing(entry, opened, read_mesh, room):
     from btfpipe.surface import Surface
     from btfpipe.synthesis import CoordinateMap
 
-    def open_once(opener, file, *which):
-        key = (opener, file, *which)
+    def open_once(opener, file):
+        key = (opener, file)
         if key not in opened:
-            opened[key] = opener(file, *which)
+            opened[key] = opener(file)
             if room is not None:
                 _require_room(file, opened, room)
         return opened[key]
@@ -278,7 +282,7 @@ def _thing(entry, opened, read_mesh, room):
                 f"{entry['map']}: made for surface {belongs}; {entry['surface']} is {surface.digest}. Run"
                 " `btfpipe synthesize` on this surface, or name the other."
             )
-        appearance = open_once(open_appearance, entry["model"], entry.get("material"))
+        appearance = _material(open_once(open_appearance, entry["model"]), entry)
         return objects.dressed_surface(
             surface.levels[0], coordinates, appearance, interpolation, entry["map"]
         )
@@ -290,7 +294,7 @@ def _thing(entry, opened, read_mesh, room):
                 raise InputError(f"{entry['map']}: a map over a surface; this object is a plane.")
         return objects.patch(
             entry["plane"],
-            open_once(open_appearance, entry["model"], entry.get("material")),
+            _material(open_once(open_appearance, entry["model"]), entry),
             interpolation,
             coordinates=coordinates,
             texels_per_unit=entry.get("texels_per_unit"),
