@@ -3,6 +3,7 @@
 import numpy as np
 
 from btfpipe.compiled import leaf
+from btfpipe.sample.light_slices import LightSlices
 from btfpipe.sample.shading import PairShader, corners
 
 _MANY_LIGHTS = 4  # as measured, at 1 to 4 pixels a texel
@@ -28,6 +29,7 @@ class CodedShader(PairShader):
         self.colour = model.colour
         if self.pairs.near is None:
             self.many_lights = _MANY_LIGHTS
+            self.slice_bytes = 12 * len(self.pairs.inverse_cosines)
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -39,6 +41,10 @@ class CodedShader(PairShader):
                 self.texture, *self.angular, self.colour, self.rows, self.cols, self.toroidal,
                 row[part], col[part], pair, share, near, root, texel, bilinear, out[part],
             )  # fmt: skip
+
+    def slices(self, row, col, w_o):
+        """See `Appearance.shader`."""
+        return LightSlices(self, row, col, w_o)
 
     def seen(self, texels, view):
         """Values (n, lights, 3) float32 of texels (n,) from a measured view under every measured light."""

@@ -23,6 +23,8 @@ class HarmonicsShader:
     model : HarmonicsModel
     """
 
+    many_lights = 2
+
     def __init__(self, model):
         self.rows, self.cols = model.shape
         self.toroidal = model.toroidal
@@ -32,6 +34,7 @@ class HarmonicsShader:
         self.codes = np.asarray(model.coefficient_codes).reshape(-1, 3, all_terms)
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
+        self.slice_bytes = 12 * model.light_terms
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -39,6 +42,33 @@ class HarmonicsShader:
             self.codes, self.minimum, self.step, self.view_table, self.light_table,
             self.rows, self.cols, self.toroidal, row, col, w_i, lifted(w_o), out,
         )  # fmt: skip
+
+    def slices(self, row, col, w_o):
+        """See `Appearance.shader`."""
+        return HarmonicSlices(self, row, col, w_o)
+
+
+class HarmonicSlices:
+    """What look-ups show from their views, as harmonics of the light.
+
+    Parameters
+    ----------
+    shader : HarmonicsShader
+    row, col, w_o
+        As for `Appearance.shader`.
+    """
+
+    def __init__(self, shader, row, col, w_o):
+        self.table = shader.light_table
+        self.coefficients = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
+        _slice(
+            shader.codes, shader.minimum, shader.step, shader.view_table, shader.rows, shader.cols, shader.toroidal,
+            row, col, lifted(w_o), self.coefficients,
+        )  # fmt: skip
+
+    def shade(self, chosen, w_i, out):
+        """Fill `out`; see `Appearance.shader`."""
+        _sum(self.coefficients, self.table, chosen, w_i, out)
 
 
 @leaf(fastmath=FAST)
@@ -99,3 +129,56 @@ def _shade(
         for c in range(3):
             weigh(products, minimum, step, c, weights, base)
         contract(codes, texel, share, weights, base, q, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _slice(codes, minimum, step, view_table, rows, cols, toroidal, row, col, w_o, out):
+    view = np.empty(view_table.shape[0] ** 2, np.float32)
+    texel = np.zeros(4, np.int64)
+    share = np.zeros(4, np.float32)
+    for q in range(len(row)):
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
+        fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
+        for c in range(3):
+            _contract_view(codes, minimum, step, c, view, texel, share, out[q, c])
+
+
+@leaf(fastmath=FAST)
+def _contract_view(codes, minimum, step, c, view, texel, share, out):
+    """Fill the coefficients (light terms,) of channel `c` over the lights, from one view, between four texels."""
+    first = codes[texel[0], c]
+    second = codes[texel[1], c]
+    third = codes[texel[2], c]
+    fourth = codes[texel[3], c]
+    least = minimum[c]
+    scale = step[c]
+    lights = len(out)
+    for j in range(lights):
+        out[j] = np.float32(0)
+    for i in range(len(view)):
+        at = i * lights
+        for j in range(lights):
+            n = at + j
+            code = (
+                share[0] * np.float32(first[n])
+                + share[1] * np.float32(second[n])
+                + share[2] * np.float32(third[n])
+                + share[3] * np.float32(fourth[n])
+            )
+            out[j] += view[i] * (least[n] + scale[n] * code)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _sum(coefficients, light_table, chosen, w_i, out):
+    light = np.empty(light_table.shape[0] ** 2, np.float32)
+    for q in range(len(chosen)):
+        if not w_i[q, 2] > 0.0:
+            out[q, :] = 0.0
+            continue
+        fill_harmonics(float(w_i[q, 0]), float(w_i[q, 1]), float(w_i[q, 2]), light_table, light)
+        for c in range(3):
+            some = coefficients[chosen[q], c]
+            total = np.float32(0)
+            for j in range(len(light)):
+                total += light[j] * some[j]
+            out[q, c] = total

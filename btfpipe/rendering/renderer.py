@@ -6,7 +6,6 @@ from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.clearance import clearance
-from btfpipe.sample.light_slices import LightSlices
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
@@ -25,9 +24,12 @@ def tile_bytes(samples):
     return tile_side(samples) ** 2 * samples * _RAY_BYTES
 
 
-def _has_many(lights, shader):
-    """Whether slices are faster than one light after the other."""
-    many = getattr(shader, "many_lights", None)
+def _is_sliced(thing, lights):
+    """Whether the lights of an object are many enough to share work."""
+    if thing.dressing is None:
+        return False
+    many = getattr(thing.dressing.shader, "many_lights", None)
+    lights = [light for light in lights if light.environment not in thing.dressing.skies]
     return many is not None and len(lights) >= many
 
 
@@ -60,7 +62,7 @@ class Renderer:
         self.sliced = {
             number: thing.dressing.shader
             for number, thing in enumerate(scene.objects)
-            if thing.dressing is not None and _has_many(scene.lights, thing.dressing.shader)
+            if _is_sliced(thing, scene.lights)
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
         # single precision positions are this far off at the scene's size
@@ -138,7 +140,7 @@ class Renderer:
         thing = self.scene.objects[number]
         mine = np.flatnonzero(points.thing == number)
         row, col, _, at_o, _, target = self._look_up(thing, mine, points, points.toward_eye)
-        return LightSlices(self.sliced[number], row, col, at_o), target
+        return self.sliced[number].slices(row, col, at_o), target
 
     def _add_light(self, light, points, slices, radiance):
         """Add one light's share to the radiance of all points."""

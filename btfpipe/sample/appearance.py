@@ -65,8 +65,11 @@ class Appearance:
         `row`, `col` (n,) float32 are texel coordinates, read bilinearly (wrapping if toroidal, else clamped);
         `w_i`, `w_o` (n, 3) float32 are unit vectors in the sample's own frame. The call releases the GIL and may
         run on several threads at once. Between measured lights value / cos(theta_i) is interpolated and
-        multiplied by the true cosine; a light below the horizon gives 0. A shader with an attribute `many_lights` that is
-        not None is given so many lights, or more, by way of `LightSlices`.
+        multiplied by the true cosine; a light below the horizon gives 0.
+
+        A shader may share the work of many lights: ``slices(row, col, w_o)`` is then what look-ups show whatever the light,
+        and its ``shade(chosen, w_i, out)`` fills ``out`` with the values of look-ups (m,) of them under a light each. It takes
+        ``slice_bytes`` a look-up and is faster from ``many_lights`` lights on. Call it with BLAS on one thread.
         """
         raise NotImplementedError
 

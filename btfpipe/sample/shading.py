@@ -26,24 +26,12 @@ class PairShader:
     appearance : Appearance
     interpolation : str
         See `PairWeights`.
-
-    Attributes
-    ----------
-    many_lights : int or None
-        Number of lights from which `LightSlices` are faster than one light after the other, for shaders that have ``seen``.
     """
-
-    many_lights = None
 
     def __init__(self, appearance, interpolation="barycentric"):
         self.pairs = PairWeights(appearance, interpolation)
         self.rows, self.cols = appearance.shape
         self.toroidal = bool(appearance.toroidal)
-
-    @property
-    def slice_bytes(self):
-        """Of one look-up under all measured lights."""
-        return 12 * len(self.pairs.inverse_cosines)
 
 
 class RawShader(PairShader):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from btfpipe.compression.coded import compress_coded
+from btfpipe.compression.harmonics import compress_harmonics
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
 from btfpipe.sample.light_slices import LightSlices
@@ -12,6 +13,11 @@ from btfpipe.sample.light_slices import LightSlices
 @pytest.fixture
 def model(make_sample):
     return compress_coded(make_sample(rows=11, cols=13, toroidal=True), 6)
+
+
+@pytest.fixture
+def harmonics(make_sample):
+    return compress_harmonics(make_sample(rows=11, cols=13, toroidal=True), 4, 9)
 
 
 def directions(rng, n, lowest=0.0):
@@ -50,16 +56,30 @@ def test_slices_show_what_a_sample_of_the_same_values_shows(model, rng, interpol
         assert (found[w_i[:, 2] <= 0] == 0).all()
 
 
+def test_slices_of_harmonics_show_what_the_model_evaluates(harmonics, rng):
+    n = 500
+    row, col = (rng.uniform(-4, 18, n).astype(np.float32) for _ in range(2))
+    w_o = directions(rng, n)
+    slices = harmonics.shader().slices(row, col, w_o)
+    chosen = np.flatnonzero(rng.random(n) < 0.5)
+    w_i = directions(rng, len(chosen), -0.2)
+    found = np.full((len(chosen), 3), np.nan, np.float32)
+    slices.shade(chosen, w_i, found)
+    expected = harmonics.evaluate(row[chosen], col[chosen], w_i, w_o[chosen])
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert expected.max() > 0.2
+
+
 def test_nothing_to_look_up_is_no_error(model):
     none = np.zeros(0, np.float32)
     slices = LightSlices(model.shader(), none, none, np.zeros((0, 3), np.float32))
     slices.shade(np.zeros(0, np.int64), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
 
 
-@pytest.fixture
-def under(model, sphere, scene_file, render_file, tmp_path):
-    """Render two spheres, one before the other, of the Model under some lights."""
-    model.save(tmp_path / "m.model.npz")
+@pytest.fixture(params=["model", "harmonics"])
+def under(request, sphere, scene_file, render_file, tmp_path):
+    """Render two spheres, one before the other, of a Model under some lights."""
+    request.getfixturevalue(request.param).save(tmp_path / "m.model.npz")
     entry = sphere(lambda lat, lon: (7 * lat, 9 * lon), rings=24, segments=48)
     entry["model"] = "m.model.npz"
     behind = entry | {"transform": {"translate": [0.7, 0.5, -1.5]}}
