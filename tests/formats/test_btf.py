@@ -17,7 +17,8 @@ from btfpipe.compression import open_appearance
 from btfpipe.compression.factored import SPACES, FactoredModel
 from btfpipe.directions import from_angles, ubo2014
 from btfpipe.errors import InputError
-from btfpipe.formats.btf import read_btf, recognise, write_btf
+from btfpipe.formats.btf import read_btf, recognise
+from btfpipe.formats.btf_writing import write_btf
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
 from btfpipe.sample.ingest import ingest
