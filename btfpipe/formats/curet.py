@@ -33,7 +33,8 @@ from btfpipe.formats.compress_z import MAGIC, decompress
 from btfpipe.formats.curet_geometry import LARGEST_SHIFT, find_shifts, fit, outline, resample
 from btfpipe.formats.curet_writing import write_curet
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
-from btfpipe.formats.ubo import SETTINGS, parse_name
+from btfpipe.formats.picture_sets import SETTINGS
+from btfpipe.formats.ubo import parse_name
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.measurement import Measurement
 

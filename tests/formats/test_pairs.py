@@ -53,6 +53,7 @@ def test_a_product_comes_back_as_that_product(tmp_path, make_sample, target, suf
     assert back.is_product
     assert (back.toroidal, back.texels_per_mm, back.absolute) == (True, 2.5, True)
     assert facts["format"] == "pairs (vectors)"
+    assert facts["n_strays"] == 0
 
 
 @settings(max_examples=10, deadline=None)
