@@ -224,9 +224,7 @@ def _find(archive, wanted):
 def _read_table(archive, name):
     """A list, its rows not looked at yet."""
     label = archive.label(name)
-    if archive.size(name) > _MOST_LIST:
-        raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of pictures.")
-    data = archive.read(name)
+    data = archive.read(name, _MOST_LIST, "a list of pictures")
     try:
         read = _json if name.lower().endswith(".json") else _csv
         header, rows, settings = read(data.decode("utf-8-sig"))
@@ -347,7 +345,8 @@ def _directions(listed, label):
         return [from_angles(*np.radians(a).T) for a in angles]
     vectors = []
     for what, part in (("light", numbers[:, :3]), ("view", numbers[:, 3:])):
-        length = np.linalg.norm(part, axis=1)
+        with np.errstate(over="ignore"):  # what is too long is refused below
+            length = np.linalg.norm(part, axis=1)
         bad = np.flatnonzero(~((length > 1e-9) & (length < 1e12) & (part[:, 2] >= 0)))
         if listed.kind == "positions":
             bad = np.union1d(bad, np.flatnonzero(part[:, 2] <= 0))

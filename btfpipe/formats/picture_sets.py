@@ -9,6 +9,7 @@ from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
 
 SETTINGS = "btfpipe.json"
+_MOST_SETTINGS = 1 << 20  # bytes
 
 
 def measurement_of_pictures(
@@ -63,7 +64,7 @@ def read_settings(archive, name):
     """Settings of a set that btfpipe wrote, checked."""
     label = archive.label(name)
     try:
-        settings = json.loads(archive.read(name))
+        settings = json.loads(archive.read(name, _MOST_SETTINGS, "settings of a set"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{label}: not JSON ({error}).") from error
     if not isinstance(settings, dict):

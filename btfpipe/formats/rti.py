@@ -111,9 +111,7 @@ def _lists(archive, wanted):
 def _lines(archive, name):
     """Lines (number, text) of a list that are not empty, and the number of pictures that the first of them says."""
     label = archive.label(name)
-    if archive.size(name) > _MOST_LIST:
-        raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of lights.")
-    text = archive.read(name)
+    text = archive.read(name, _MOST_LIST, "a list of lights")
     try:
         text = text.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -141,7 +139,8 @@ def _parse(archive, name):
             light = np.array([float(word) for word in words[1:]])
         except ValueError:
             light = np.zeros(0)
-        length = np.linalg.norm(light) if len(light) == 3 else np.nan
+        with np.errstate(over="ignore"):  # what is too long is refused below
+            length = np.linalg.norm(light) if len(light) == 3 else np.nan
         if not 1e-6 < length < 1e6:
             raise InputError(f"{label}, line {number}: {line[:80]!r}; expected a name and x y z.")
         if light[2] < 0:

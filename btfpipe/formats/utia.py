@@ -11,14 +11,14 @@ exists for one view only. Without it the nominal angles are kept, the set stays 
 
 import contextlib
 import re
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
-from btfpipe.formats.archive import names_in, open_archive
+from btfpipe.formats.archive import names_in, open_archive, read_file
 from btfpipe.formats.images import Decoder, colours
 from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures
 from btfpipe.formats.writing import Pictures, angles_deg, create_set
@@ -65,14 +65,7 @@ def read_shifts(path):
     InputError
         If it cannot be read, has no such line, a wrong one, or one direction twice.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MOST_LIST + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
-    if len(text) > _MOST_LIST:
-        raise InputError(f"{path}: longer than {_MOST_LIST} bytes; expected a list of directions.")
+    text = read_file(path, _MOST_LIST, "a list of directions")
     shifts = {}
     for number, line in enumerate(text.decode("latin-1").splitlines(), 1):
         words = re.split(r"[\s,;]+", line.strip())

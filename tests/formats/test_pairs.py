@@ -192,6 +192,7 @@ POSITIONS = "name," + ",".join(pairs.COLUMNS["positions"]) + "\n"
         (HEAD.replace("\n", ",name\n") + "a.png,0,0,0,0,b\n", "expected one .csv or .json"),
         ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,0,0,0,1\n", "light of 'a.png'"),
         ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,1,0,0,-1\n", "view of 'a.png'"),
+        ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,1,1e300,0,1\n", "view of 'a.png'"),
         (POSITIONS + "a.png,1,2,0,0,0,9\n", "light of 'a.png'"),
         (POSITIONS + "a.png,1,2,5,0,0,9\n", "--patch-cm"),
     ],
