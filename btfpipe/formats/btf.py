@@ -18,10 +18,11 @@ What no measured file has confirmed yet:
 - The first stored row is taken as the top of the picture, as the library of the data's makers shows it; another
   reader turns the rows over. Azimuth 0 is taken along the columns, turning towards the picture's top, as in UBO2003.
 - A cosine flag of 1 means that the light's cosine is inside the values, which is this project's convention; otherwise
-  (and in files older than the flag) values are taken as divided by it, and each pair gets its light's cosine as a
-  factor. `cosine` overrides that.
-- Lab is taken under D50 to linear Rec. 709. The RGB scale factors of the header are reported, not applied.
-- The mask of a BDI is taken with columns fastest.
+  (and in files older than the flag, as in the makers' library) values are taken as divided by it, and each pair gets its
+  light's cosine as a factor. `cosine` overrides that.
+- Lab is taken under D50 to linear Rec. 709, as the other colour models are linear; the makers' library gives display values
+  there. The RGB scale factors of the header are reported, not applied.
+- The mask of a BDI is taken with columns fastest, as the makers' library writes it (it reads it the other way).
 """
 
 from btfpipe.errors import InputError

@@ -128,18 +128,19 @@ def read_bdi(file, header, memory):
         if len(stored) < len(header.mask):
             header.facts["missing_texels"] = len(header.mask) - len(stored)
     n_values = 3 * header.n_pairs
-    most = min(header.cols * header.scan_lines, max(len(stored), 1))
+    full = header.cols * header.scan_lines
     chunks = []
-    for first in range(0, len(stored), most):
+    for first in range(0, len(stored), min(full, max(len(stored), 1))):
         section = f"chunk {len(chunks)}"
-        count = min(most, len(stored) - first)
+        count = min(full, len(stored) - first)
         (size,) = file.unpack("I", section)
-        if size != 2 * n_values * count:
+        # the makers' library writes a last chunk as long as the others, with nothing at its end
+        if size not in (2 * n_values * count, 2 * n_values * full):
             raise file.wrong(
                 f"{section}: bytes", size, f"{2 * n_values * count}, for {count} texels"
             )
-        chunk = file.array((count, n_values), np.dtype("<f2"), section)
-        chunks.append((stored[first : first + count], chunk))
+        chunk = file.array((size // (2 * n_values), n_values), np.dtype("<f2"), section)
+        chunks.append((stored[first : first + count], chunk[:count]))
     file.finish()
     windows = _Windows(chunks, len(header.mask), header.n_pairs, memory)
     factor = header.pair_factor()

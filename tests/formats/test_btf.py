@@ -517,6 +517,23 @@ def test_bdi_is_turned_into_pictures_within_its_memory(put, rng, packing, memory
     assert measurement.facts.get("missing_texels", 0) == (packing == 2) * (~mask).sum()
 
 
+@pytest.mark.parametrize("scan_lines", [3, 9])
+@pytest.mark.parametrize("packing", [0, 2])
+def test_the_last_chunk_of_a_bdi_may_be_as_long_as_the_others(put, rng, scan_lines, packing):
+    values = rng.random((ROWS, COLS, len(VIEWS), len(LIGHTS), 3)).astype(np.float16)
+    sections = bdi(values, packing, scan_lines=scan_lines)
+    name, chunk = sections[-1]
+    full = COLS * scan_lines * 3 * N_PAIRS * 2
+    assert len(chunk) < full
+    padded = u32(full) + chunk[4:] + bytes(full - len(chunk) + 4)
+    measurement = read_btf(put([*sections[:-1], (name, padded)]))
+    for pair in range(N_PAIRS):
+        view, light = divmod(pair, len(LIGHTS))
+        np.testing.assert_array_equal(measurement.read(pair), values[:, :, view, light])
+    refuses(put([*sections[:-1], (name, u32(full - 2) + padded[4:-2])]), "chunk .* for")
+    refuses(put([*sections[:-1], (name, padded[:-1])]), "truncated")
+
+
 def test_bdi_may_have_more_chunks_than_a_process_may_have_mappings(put, rng):
     values = rng.random((70000, 1, 3)).astype(np.float16)
     data = joined([("", b"!BDIF06R2!"), *meta(), *directions(VIEWS[:1], LIGHTS[:1])])
