@@ -3,7 +3,6 @@
 Nothing is unpacked; a zip's members are read by their place in the file, on any number of threads at once.
 """
 
-import contextlib
 import os
 import re
 import struct
@@ -17,6 +16,15 @@ from btfpipe.errors import InputError
 COPY = re.compile(r" \(member \d+ of that name\)$")  # tells members of one name apart
 _MAX_MEMBER = 2**30  # bytes of one picture, far above any real one
 _MAX_RATIO = 1032  # of deflate: more is a lie
+# What zipfile raises of a directory with wrong bytes: a version, a name or an extra field that cannot be.
+_BROKEN = (
+    zipfile.BadZipFile,
+    NotImplementedError,
+    IndexError,
+    ValueError,
+    OverflowError,
+    struct.error,
+)
 
 
 def is_zip(path):
@@ -60,6 +68,21 @@ def names_in(path):
         return []
 
 
+def read_file(path, most, expected):
+    """Bytes of a file; one longer than `most` bytes is refused unread."""
+    try:
+        with open(path, "rb") as file:
+            if os.fstat(file.fileno()).st_size > most:
+                raise _too_long(path, most, expected)
+            return file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def _too_long(label, most, expected):
+    return InputError(f"{label}: longer than {most} bytes; expected {expected}.")
+
+
 class Folder:
     """The files below a folder; names are relative, with forward slashes.
 
@@ -77,18 +100,9 @@ class Folder:
     def __exit__(self, *_):
         pass
 
-    def read(self, name):
-        """Bytes of one file."""
-        try:
-            return (self.path / name).read_bytes()
-        except OSError as error:
-            raise InputError(f"{self.path / name}: cannot be read ({error.strerror}).") from error
-
-    def size(self, name):
-        """Bytes of one file; 0 if it vanished."""
-        with contextlib.suppress(OSError):
-            return (self.path / name).stat().st_size
-        return 0
+    def read(self, name, most=_MAX_MEMBER, expected="a picture"):
+        """Bytes of one file; one longer than `most` bytes is refused unread."""
+        return read_file(self.path / name, most, expected)
 
     def label(self, name):
         """What messages call a file."""
@@ -106,7 +120,7 @@ class Zip:
             with zipfile.ZipFile(self.path) as archive:
                 members = [info for info in archive.infolist() if not info.is_dir()]
             self._file = os.open(self.path, os.O_RDONLY)
-        except zipfile.BadZipFile as error:
+        except _BROKEN as error:
             raise InputError(
                 f"{path}: not a zip file, or a truncated one ({error}). Fetch it again."
             ) from error
@@ -142,7 +156,7 @@ class Zip:
                 )
             if (
                 info.file_size > _MAX_MEMBER
-                or info.compress_size > total
+                or not 0 <= info.header_offset <= total - info.compress_size
                 or info.file_size > _MAX_RATIO * info.compress_size + 64
             ):
                 raise InputError(
@@ -160,9 +174,11 @@ class Zip:
     def __exit__(self, *_):
         os.close(self._file)
 
-    def read(self, name):
-        """Bytes of one member, checked against its checksum."""
+    def read(self, name, most=_MAX_MEMBER, expected="a picture"):
+        """Bytes of one member, checked against its checksum; one longer than `most` bytes is refused unread."""
         info = self._members[name]
+        if info.file_size > most:
+            raise _too_long(self.label(name), most, expected)
         header = os.pread(self._file, 30, info.header_offset)
         if header[:4] != b"PK\x03\x04" or len(header) < 30:
             raise InputError(f"{self.label(name)}: truncated or damaged archive; fetch it again.")
@@ -182,10 +198,6 @@ class Zip:
         if len(data) != info.file_size or zlib.crc32(data) != info.CRC:
             raise InputError(f"{self.label(name)}: damaged in the archive (wrong checksum).")
         return data
-
-    def size(self, name):
-        """Bytes of one member, unpacked."""
-        return self._members[name].file_size
 
     def label(self, name):
         """What messages call a member."""

@@ -28,12 +28,13 @@ import numpy as np
 
 from btfpipe.directions.curet import COUNT, curet205
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import COPY, is_zip, open_archive
+from btfpipe.formats.archive import COPY, is_zip, open_archive, read_file
 from btfpipe.formats.compress_z import MAGIC, decompress
 from btfpipe.formats.curet_geometry import LARGEST_SHIFT, find_shifts, fit, outline, resample
 from btfpipe.formats.curet_writing import write_curet
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
-from btfpipe.formats.ubo import SETTINGS, parse_name
+from btfpipe.formats.picture_sets import SETTINGS
+from btfpipe.formats.ubo import parse_name
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.measurement import Measurement
 
@@ -51,6 +52,7 @@ _HEADER = 54
 _MAX_PICTURE = 2**28
 _PADDING = 4096  # bytes after the pixels, which some writers leave
 _SAMPLES = 61
+_MOST_TABLE = 1 << 20  # bytes
 
 
 def irradiance(sample_number):
@@ -435,9 +437,9 @@ def _calibration(path, archive, listing, sample_number):
         beside = path.parent / base
         if base in listing.calibrations:
             label = archive.label(listing.calibrations[base])
-            data = archive.read(listing.calibrations[base])
+            data = archive.read(listing.calibrations[base], _MOST_TABLE, "a table of numbers")
         elif beside.is_file():
-            label, data = str(beside), beside.read_bytes()
+            label, data = str(beside), read_file(beside, _MOST_TABLE, "a table of numbers")
         else:
             continue
         if sample_number is None:
@@ -486,12 +488,7 @@ def _row(table, sample_number, columns, label):
 
 def read_brdf_table(path):
     """The BRDFs of ``abrdf.dat`` or its kin: dict of sample number to (205,) values, 1/sr."""
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
-    table = _table(data, path)
+    table = _table(read_file(path, _MOST_TABLE, "a table of numbers"), path)
     if table.shape[1] != 1 + COUNT:
         raise InputError(f"{path}: has {table.shape[1]} numbers a row; expected {1 + COUNT}.")
     return {int(row[0]): row[1:] for row in table}

@@ -19,6 +19,9 @@ from btfpipe.formats.rgbe import decode_rgbe
 
 _MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 _MAX_PIXELS = 2**28
+_MOST_IN_JPEG = (
+    8 * 1032
+)  # pixels a byte; plain ones have 512 at most, a bit for each block of 8 x 8
 
 # First bytes of the formats, and the ending that each is known by.
 _SIGNATURES = [
@@ -120,18 +123,26 @@ def _radiance(data, name):
 
 def _decode_file(path, name, suffix):
     """Decode the picture file at `path`; messages call it `name`."""
-    import OpenImageIO as oiio
-
     if suffix == ".hdr":
         return _radiance(Path(path).read_bytes(), name)
+    if suffix == ".png" and not _png_ends(path):
+        # found here, because the library below prints its own line about it
+        raise InputError(f"{name}: truncated or damaged picture (no end of a PNG).")
+    try:
+        return _decode_by_library(path, name, suffix)
+    except (
+        UnicodeDecodeError
+    ) as error:  # of names of channels and the like, or of what the library says of them
+        raise InputError(f"{name}: truncated or damaged picture (a text in it is none).") from error
+
+
+def _decode_by_library(path, name, suffix):
+    import OpenImageIO as oiio
 
     def reason(text):
         text = (text or "unknown format").replace(f' ("{path}")', "").replace(str(path), str(name))
         return text.strip().splitlines()[0].rstrip(".")
 
-    if suffix == ".png" and not _png_ends(path):
-        # found here, because the library below prints its own line about it
-        raise InputError(f"{name}: truncated or damaged picture (no end of a PNG).")
     opened = oiio.ImageInput.open(str(path), _config(oiio))
     if opened is None:
         problem = reason(oiio.geterror())
@@ -144,6 +155,12 @@ def _decode_file(path, name, suffix):
         raise InputError(
             f"{name}: declares {spec.height} x {spec.width} pixels; expected a picture of at most"
             f" {_MAX_PIXELS} pixels."
+        )
+    size = os.stat(path).st_size
+    if suffix == ".jpg" and spec.width * spec.height > _MOST_IN_JPEG * size:
+        opened.close()
+        raise InputError(
+            f"{name}: truncated or damaged picture ({spec.height} x {spec.width} pixels cannot lie in {size} bytes)."
         )
     kinds = {oiio.UINT8: oiio.UINT8, oiio.UINT16: oiio.UINT16, oiio.HALF: oiio.HALF}
     values = opened.read_image(kinds.get(spec.format.basetype, oiio.FLOAT))

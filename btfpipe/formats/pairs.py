@@ -25,9 +25,15 @@ from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
 from btfpipe.formats.archive import is_zip, open_archive
-from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.formats.images import Decoder
+from btfpipe.formats.picture_sets import (
+    SETTINGS,
+    beside,
+    check_settings,
+    measurement_of_pictures,
+    settings_beside,
+)
 from btfpipe.formats.writing import Pictures, create_set
-from btfpipe.sample.measurement import Measurement
 
 COLUMNS = {
     "angles": ("theta_l", "phi_l", "theta_v", "phi_v"),
@@ -106,8 +112,7 @@ def open_measurement(path, *, listing=None, patch_cm=None):
         lights, views = _directions(listed, label)
         facts = {
             "format": f"pairs ({listed.kind})",
-            "strays": sorted({*archive.names} - {*members, listed.member}),
-            "mislabelled": set(),
+            "strays": sorted({*archive.names} - {*members, listed.member, beside(listed.member)}),
         }
         lamps = None
         if listed.kind == "positions":
@@ -116,37 +121,25 @@ def open_measurement(path, *, listing=None, patch_cm=None):
             if patch_cm is None:
                 raise InputError(
                     f"{label}: positions need the patch's height and width in cm: give --patch-cm, or patch_cm in"
-                    f" {ubo.SETTINGS}."
+                    f" {SETTINGS}."
                 )
             reference = float(np.median(np.linalg.norm(lamps, axis=1)))
             facts |= _spread(lamps, cameras, patch_cm, reference)
         order, tables = _arrange(lights, views, listed.names, label)
         members = [members[i] for i in order]
-        labels = [archive.label(name) for name in members]
-
-        def read(pair):
-            picture = decoder.decode(archive.read(members[pair]), labels[pair])
-            if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].add(members[pair])
-            return colours(picture, labels[pair])
 
         def correct(pair, picture):
             lamp = lamps[order[pair]]
             return picture * correction(picture.shape[:2], patch_cm, lamp, reference)[..., None]
 
-        def transfer(picture):
-            return "linear" if picture.dtype.kind == "f" else settings.get("transfer") or "srgb"
-
-        yield Measurement(
-            source=Path(path),
-            names=labels,
-            read=read,
-            transfer=transfer,
+        yield measurement_of_pictures(
+            path,
+            archive,
+            decoder,
+            members,
+            settings,
+            facts,
             correct=correct if lamps is not None else None,
-            white=settings.get("white"),
-            toroidal=settings.get("toroidal"),
-            texels_per_mm=settings.get("texels_per_mm"),
-            facts=facts,
             **tables,
         )
 
@@ -221,7 +214,7 @@ def _find(archive, wanted):
     found = []
     for name in archive.names:
         base = PurePosixPath(name).name
-        likely = base.lower().endswith(_ENDINGS) and base != ubo.SETTINGS
+        likely = base.lower().endswith(_ENDINGS) and base != SETTINGS
         if likely and not base.startswith(".") and "__MACOSX/" not in name:
             with contextlib.suppress(InputError):
                 found.append(_read_table(archive, name))
@@ -231,9 +224,7 @@ def _find(archive, wanted):
 def _read_table(archive, name):
     """A list, its rows not looked at yet."""
     label = archive.label(name)
-    if archive.size(name) > _MOST_LIST:
-        raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of pictures.")
-    data = archive.read(name)
+    data = archive.read(name, _MOST_LIST, "a list of pictures")
     try:
         read = _json if name.lower().endswith(".json") else _csv
         header, rows, settings = read(data.decode("utf-8-sig"))
@@ -317,9 +308,8 @@ def _number(value):
 
 def _settings(archive, listed, label):
     """Settings from the list and from ``btfpipe.json`` beside it; the list's go first."""
-    beside = (PurePosixPath(listed.member).parent / ubo.SETTINGS).as_posix()
-    settings = ubo.read_settings(archive, beside) if beside in archive.names else {}
-    settings |= ubo.check_settings(listed.settings, label)
+    settings = settings_beside(archive, listed.member)
+    settings |= check_settings(listed.settings, label)
     size = settings.get("patch_cm")
     if size is not None:
         good = isinstance(size, list) and len(size) == 2 and all(0 < _number(s) < 1e6 for s in size)
@@ -355,7 +345,8 @@ def _directions(listed, label):
         return [from_angles(*np.radians(a).T) for a in angles]
     vectors = []
     for what, part in (("light", numbers[:, :3]), ("view", numbers[:, 3:])):
-        length = np.linalg.norm(part, axis=1)
+        with np.errstate(over="ignore"):  # what is too long is refused below
+            length = np.linalg.norm(part, axis=1)
         bad = np.flatnonzero(~((length > 1e-9) & (length < 1e12) & (part[:, 2] >= 0)))
         if listed.kind == "positions":
             bad = np.union1d(bad, np.flatnonzero(part[:, 2] <= 0))

@@ -176,7 +176,8 @@ def _read_hsh(path, head, size, transfer):
         )
     n = int(n)
     body = _read_body(path, lines.at, 8 * n + rows * cols * 3 * n, size)
-    scale, bias = body[: 8 * n].view("<f4").astype(float).reshape(2, n)
+    with np.errstate(invalid="ignore"):  # a NaN may warn by itself
+        scale, bias = body[: 8 * n].view("<f4").astype(float).reshape(2, n)
     if not np.isfinite([scale, bias]).all():
         raise InputError(f"{path}: NaN or infinite scales; the file is damaged.")
     codes = body[8 * n :].reshape(rows, cols, 3, n)

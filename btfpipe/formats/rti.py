@@ -11,11 +11,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.formats import ubo
 from btfpipe.formats.archive import open_archive
-from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.formats.images import Decoder
+from btfpipe.formats.picture_sets import beside, measurement_of_pictures, settings_beside
 from btfpipe.formats.writing import Pictures, angles_deg, create_set
-from btfpipe.sample.measurement import Measurement
 
 LIST = "lights.lp"
 _MOST_LIST = 1 << 24  # bytes
@@ -73,39 +72,20 @@ def open_measurement(path, *, listing=None):
                 f"{path}: expected one list of lights (.lp); found {', '.join(lists) or 'none'}.{which}"
             )
         names, lights = _parse(archive, lists[0])
-        label = archive.label(lists[0])
-        members = _members(archive, lists[0], names, label)
-        labels = [archive.label(name) for name in members]
-        beside = (PurePosixPath(lists[0]).parent / ubo.SETTINGS).as_posix()
-        settings = ubo.read_settings(archive, beside) if beside in archive.names else {}
-        facts = {
-            "format": "RTI",
-            "strays": sorted({*archive.names} - {*members, lists[0], beside}),
-            "mislabelled": set(),
-        }
-
-        def read(pair):
-            picture = decoder.decode(archive.read(members[pair]), labels[pair])
-            if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].add(members[pair])
-            return colours(picture, labels[pair])
-
-        def transfer(picture):
-            return "linear" if picture.dtype.kind == "f" else settings.get("transfer") or "srgb"
-
-        yield Measurement(
-            source=Path(path),
+        members = _members(archive, lists[0], names, archive.label(lists[0]))
+        settings = settings_beside(archive, lists[0])
+        strays = {*archive.names} - {*members, lists[0], beside(lists[0])}
+        yield measurement_of_pictures(
+            path,
+            archive,
+            decoder,
+            members,
+            settings,
+            {"format": "RTI", "strays": sorted(strays)},
             light_directions=lights,
             view_directions=np.array([[0.0, 0.0, 1.0]]),
             light_index=np.arange(len(lights), dtype=np.int32),
             view_index=np.zeros(len(lights), np.int32),
-            names=labels,
-            read=read,
-            transfer=transfer,
-            white=settings.get("white"),
-            toroidal=settings.get("toroidal"),
-            texels_per_mm=settings.get("texels_per_mm"),
-            facts=facts,
         )
 
 
@@ -131,9 +111,7 @@ def _lists(archive, wanted):
 def _lines(archive, name):
     """Lines (number, text) of a list that are not empty, and the number of pictures that the first of them says."""
     label = archive.label(name)
-    if archive.size(name) > _MOST_LIST:
-        raise InputError(f"{label}: longer than {_MOST_LIST} bytes; expected a list of lights.")
-    text = archive.read(name)
+    text = archive.read(name, _MOST_LIST, "a list of lights")
     try:
         text = text.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -161,7 +139,8 @@ def _parse(archive, name):
             light = np.array([float(word) for word in words[1:]])
         except ValueError:
             light = np.zeros(0)
-        length = np.linalg.norm(light) if len(light) == 3 else np.nan
+        with np.errstate(over="ignore"):  # what is too long is refused below
+            length = np.linalg.norm(light) if len(light) == 3 else np.nan
         if not 1e-6 < length < 1e6:
             raise InputError(f"{label}, line {number}: {line[:80]!r}; expected a name and x y z.")
         if light[2] < 0:

@@ -16,7 +16,7 @@ WRITERS = {
         {"suffix": "suffix", "sample_number": "sample_number"},
     ),
     "rti": Writer("btfpipe.formats.rti", "write_lp", {"suffix": "suffix"}),
-    "btf": Writer("btfpipe.formats.btf", "write_btf", {"channel_components": "terms"}),
+    "btf": Writer("btfpipe.formats.btf_writing", "write_btf", {"channel_components": "terms"}),
     "pairs": Writer("btfpipe.formats.pairs", "write_pairs", {"suffix": "suffix"}),
 }
 

@@ -6,21 +6,18 @@ Bonn's sets leave open: white, transfer, toroidal, texels_per_mm.
 """
 
 import contextlib
-import json
 import math
 import re
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.archive import COPY, names_in, open_archive
-from btfpipe.formats.images import Decoder, colours, is_mislabelled
-from btfpipe.sample.measurement import Measurement
-from btfpipe.sample.transfer import TRANSFERS
+from btfpipe.formats.images import Decoder
+from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures, read_settings
 
-SETTINGS = "btfpipe.json"
 _ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _=:]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
 
@@ -125,35 +122,6 @@ def direction(angles, label):
     return (theta, round(phi % 360, 6) % 360 if theta > 0 else 0.0)
 
 
-def read_settings(archive, name):
-    """Settings of a set that btfpipe wrote, checked."""
-    label = archive.label(name)
-    try:
-        settings = json.loads(archive.read(name))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{label}: not JSON ({error}).") from error
-    if not isinstance(settings, dict):
-        raise InputError(f"{label}: holds no mapping of settings.")
-    return check_settings(settings, label)
-
-
-def check_settings(settings, label):
-    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
-    white, transfer = settings.get("white"), settings.get("transfer")
-    density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
-    for key, value in (("white", white), ("texels_per_mm", density)):
-        good = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e30
-        if value is not None and not good:
-            raise InputError(f"{label}: {key} is {value!r}; expected a positive number.")
-    if transfer is not None and transfer not in TRANSFERS:
-        raise InputError(
-            f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."
-        )
-    if toroidal is not None and not isinstance(toroidal, bool):
-        raise InputError(f"{label}: toroidal is {toroidal!r}; expected true or false.")
-    return settings
-
-
 def recognise(path):
     """Why a folder or zip is taken for UBO2003's layout, in words, or None."""
     names = [name for name in names_in(path) if name.lower().endswith(_ENDINGS)]
@@ -193,35 +161,20 @@ def open_measurement(path, *, pairs=False, frontal=False):
         chosen = listing.choose(path, pairs, frontal)
         lights, views, light_index, view_index = tables(chosen)
         members = list(chosen.values())
-        labels = [archive.label(name) for name in members]
-        mislabelled = set()
-
-        def read(pair):
-            picture = decoder.decode(archive.read(members[pair]), labels[pair])
-            if is_mislabelled(members[pair], picture.suffix):
-                mislabelled.add(members[pair])
-            return colours(picture, labels[pair])
-
-        def transfer(picture):
-            # Bonn states no response curve; users of its JPEGs invert gamma 2.2
-            jpeg = members[0].lower().endswith((".jpg", ".jpeg"))
-            display = "gamma2.2" if jpeg else "srgb"
-            return settings.get("transfer") or ("linear" if picture.dtype.kind == "f" else display)
-
-        settings = listing.settings
-        yield Measurement(
-            source=Path(path),
+        # Bonn states no response curve; users of its JPEGs invert gamma 2.2
+        jpeg = members[0].lower().endswith((".jpg", ".jpeg"))
+        yield measurement_of_pictures(
+            path,
+            archive,
+            decoder,
+            members,
+            listing.settings,
+            {"format": "UBO2003", "strays": listing.strays},
+            curve="gamma2.2" if jpeg else "srgb",
             light_directions=from_angles(*np.radians(np.array(lights).T)),
             view_directions=from_angles(*np.radians(np.array(views).T)),
             light_index=light_index,
             view_index=view_index,
-            names=labels,
-            read=read,
-            transfer=transfer,
-            white=settings.get("white"),
-            toroidal=settings.get("toroidal"),
-            texels_per_mm=settings.get("texels_per_mm"),
-            facts={"format": "UBO2003", "strays": listing.strays, "mislabelled": mislabelled},
         )
 
 

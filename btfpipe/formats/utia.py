@@ -11,18 +11,18 @@ exists for one view only. Without it the nominal angles are kept, the set stays 
 
 import contextlib
 import re
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
-from btfpipe.formats.archive import names_in, open_archive
-from btfpipe.formats.images import Decoder, colours, is_mislabelled
+from btfpipe.formats.archive import names_in, open_archive, read_file
+from btfpipe.formats.images import Decoder, colours
+from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures
 from btfpipe.formats.writing import Pictures, angles_deg, create_set
 from btfpipe.sample.colour import rgb_to_xyz, xyz_to_rgb
-from btfpipe.sample.measurement import Measurement
 
 COLOURS = ("xyz", "rgb")
 _NUMBER = r"-?\d+(?:\.\d+)?"
@@ -65,14 +65,7 @@ def read_shifts(path):
     InputError
         If it cannot be read, has no such line, a wrong one, or one direction twice.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MOST_LIST + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
-    if len(text) > _MOST_LIST:
-        raise InputError(f"{path}: longer than {_MOST_LIST} bytes; expected a list of directions.")
+    text = read_file(path, _MOST_LIST, "a list of directions")
     shifts = {}
     for number, line in enumerate(text.decode("latin-1").splitlines(), 1):
         words = re.split(r"[\s,;]+", line.strip())
@@ -129,11 +122,9 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
         settings = listing.settings
         colour = colour or settings.get("colour") or "xyz"
         if colour not in COLOURS:
-            raise InputError(
-                f"{path}: colour is {colour!r} in {ubo.SETTINGS}; expected xyz or rgb."
-            )
+            raise InputError(f"{path}: colour is {colour!r} in {SETTINGS}; expected xyz or rgb.")
         lights, views, light_index, view_index = ubo.tables(chosen)
-        facts = {"format": "UTIA", "strays": listing.strays, "mislabelled": set()}
+        facts = {"format": "UTIA", "strays": listing.strays}
         facts["coincident_pairs"] = sum(view == light for view, light in chosen)
         if directions is not None:
             shifts = read_shifts(directions)
@@ -143,34 +134,25 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
                 f"{facts['coincident_pairs']} pairs have their light where their view is; their true lights stood"
                 " aside, as the set's list of directions says. Without it the nominal ones are kept."
             ]
-        members = list(chosen.values())
-        labels = [archive.label(name) for name in members]
 
-        def read(pair):
-            picture = decoder.decode(archive.read(members[pair]), labels[pair])
-            if is_mislabelled(members[pair], picture.suffix):
-                facts["mislabelled"].add(members[pair])
+        def rgb(picture, label):
             if picture.values.dtype.kind != "f":
-                return colours(picture, labels[pair])
+                return colours(picture, label)
             facts["colour"] = f"floating-point pictures are taken as {colour}"
-            return _to_rgb(picture, colour, labels[pair])
+            return _to_rgb(picture, colour, label)
 
-        def transfer(picture):
-            return "linear" if picture.dtype.kind == "f" else settings.get("transfer") or "srgb"
-
-        yield Measurement(
-            source=Path(path),
+        yield measurement_of_pictures(
+            path,
+            archive,
+            decoder,
+            list(chosen.values()),
+            settings,
+            facts,
+            rgb=rgb,
             light_directions=from_angles(*np.radians(np.array(lights).T)),
             view_directions=from_angles(*np.radians(np.array(views).T)),
             light_index=light_index,
             view_index=view_index,
-            names=labels,
-            read=read,
-            transfer=transfer,
-            white=settings.get("white"),
-            toroidal=settings.get("toroidal"),
-            texels_per_mm=settings.get("texels_per_mm"),
-            facts=facts,
         )
 
 

@@ -12,7 +12,7 @@ from btfpipe import store
 from btfpipe.directions import to_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.images import encode_picture
-from btfpipe.formats.ubo import SETTINGS
+from btfpipe.formats.picture_sets import SETTINGS
 from btfpipe.parallel import blocks, ordered_map
 from btfpipe.sample import Sample
 from btfpipe.sample.transfer import encode

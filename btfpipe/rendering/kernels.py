@@ -239,6 +239,23 @@ def count_lookups(lit, face, weight, coherent):
     return count
 
 
+@njit(cache=True, inline="always")
+def _interpolated(layer, f, i, h, share, faces, row, col, rows, cols, toroidal):
+    """Texel coordinate at point h of the coherent face f, from its vertex i; a toroidal sample is crossed the short way."""
+    r = float(row[layer, i])
+    s = float(col[layer, i])
+    for e in range(3):
+        j = faces[f, e]
+        drow = row[layer, j] - row[layer, i]
+        dcol = col[layer, j] - col[layer, i]
+        if toroidal:
+            drow -= np.round(drow / rows) * rows
+            dcol -= np.round(dcol / cols) * cols
+        r += share[h, e] * drow
+        s += share[h, e] * dcol
+    return r, s
+
+
 @njit(cache=True, nogil=True)
 def gather_lookups(
     lit, face, share, normal, facing, toward_eye, w_i, faces, row, col, weight, axis, coherent,
@@ -275,21 +292,15 @@ def gather_lookups(
             for k in range(1 if one else 3):
                 i = faces[f, k]
                 if one:
+                    r, s = _interpolated(
+                        layer, f, i, h, share, faces, row, col, rows, cols, toroidal
+                    )
                     w = 0.0
-                    r = float(row[layer, i])
-                    s = float(col[layer, i])
                     x = 0.0
                     y = 0.0
                     z = 0.0
                     for e in range(3):
                         j = faces[f, e]
-                        drow = row[layer, j] - row[layer, i]
-                        dcol = col[layer, j] - col[layer, i]
-                        if toroidal:
-                            drow -= np.round(drow / rows) * rows
-                            dcol -= np.round(dcol / cols) * cols
-                        r += share[h, e] * drow
-                        s += share[h, e] * dcol
                         w += share[h, e] * weight[layer, j]
                         x += share[h, e] * axis[layer, j, 0]
                         y += share[h, e] * axis[layer, j, 1]
@@ -373,18 +384,11 @@ def texel_coordinates(
         for other in range(1, len(row)):
             if weight[other, i] > weight[layer, i]:
                 layer = other
-        r = float(row[layer, i])
-        s = float(col[layer, i])
         if coherent[layer, f]:
-            for e in range(3):
-                j = faces[f, e]
-                drow = row[layer, j] - row[layer, i]
-                dcol = col[layer, j] - col[layer, i]
-                if wrap:
-                    drow -= np.round(drow / rows) * rows
-                    dcol -= np.round(dcol / cols) * cols
-                r += share[h, e] * drow
-                s += share[h, e] * dcol
+            r, s = _interpolated(layer, f, i, h, share, faces, row, col, rows, cols, wrap)
+        else:
+            r = float(row[layer, i])
+            s = float(col[layer, i])
         if wrap:
             r -= np.floor(r / rows) * rows
             s -= np.floor(s / cols) * cols

@@ -12,16 +12,9 @@ from btfpipe.compression.factored import SPACES, FactoredModel, compress_factore
 from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import Hemisphere, bonn81, from_angles
 from btfpipe.errors import InputError
-from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
 
 COMPRESSIBLE = sorted(set(SPACES) - {"pca"})
-
-
-@pytest.fixture(autouse=True)
-def one_blas_thread():
-    with single_threaded_blas():
-        yield
 
 
 def everything(appearance):

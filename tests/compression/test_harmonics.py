@@ -10,15 +10,7 @@ from btfpipe.compression.model import measured_error
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.directions.spherical_harmonics import spherical_harmonics
 from btfpipe.errors import InputError
-from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
-
-
-@pytest.fixture(autouse=True)
-def one_blas_thread():
-    """Many BLAS threads on small matrices only wait for each other."""
-    with single_threaded_blas():
-        yield
 
 
 def product_sample(values, lights, views, **kwargs):

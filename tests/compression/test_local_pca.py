@@ -10,18 +10,10 @@ from hypothesis import strategies as st
 from btfpipe.compression import compress, open_appearance
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_pca import LocalPcaModel, compress_local_pca
-from btfpipe.directions import Hemisphere, bonn81, from_angles
+from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
-from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample, light_cosines
 from btfpipe.sample.resample import Resampled
-
-
-@pytest.fixture(autouse=True)
-def one_blas_thread():
-    """Many BLAS threads on small matrices only wait for each other."""
-    with single_threaded_blas():
-        yield
 
 
 def matrix(appearance):
@@ -242,7 +234,9 @@ def test_texels_and_pictures_agree(patchy_sample):
 
 @pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
 @pytest.mark.parametrize("toroidal", [True, False])
-def test_the_shader_blends_values_across_clusters(patchy_sample, rng, toroidal, interpolation):
+def test_the_shader_blends_values_across_clusters(
+    patchy_sample, blended_pictures, rng, toroidal, interpolation
+):
     samples = [patchy_sample(), patchy_sample((6, 9), noise=0.3, toroidal=toroidal)]
     precision = "byte" if toroidal else "half"
     model = compress_local_pca(samples, clusters=9, components=3, precision=precision).material(1)
@@ -255,29 +249,6 @@ def test_the_shader_blends_values_across_clusters(patchy_sample, rng, toroidal, 
     expected = blended_pictures(model, row, col, w_i, w_o, interpolation)
     assert expected.max() > 0.1
     np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
-
-
-def blended_pictures(model, row, col, w_i, w_o, interpolation):
-    """Blend whole pictures over view, and value / cos over light; then four texels."""
-    lights = Hemisphere(model.light_directions, interpolation).weights(w_i)
-    views = Hemisphere(model.view_directions, interpolation).weights(w_o)
-    cosines = light_cosines(model.light_directions)
-    pictures = model.pictures(slice(0, model.n_pairs)).astype(np.float64)
-    pictures = pictures.reshape(len(model.view_directions), len(cosines), *model.shape, 3)
-    pictures = pictures / cosines[:, None, None, None]
-    mode = "wrap" if model.toroidal else "edge"
-    out = np.zeros((len(row), 3))
-    for q in range(len(row)):
-        if w_i[q, 2] <= 0:
-            continue
-        chosen = pictures[np.ix_(views[0][q], lights[0][q])]
-        picture = np.einsum("o,i,oirck->rck", views[1][q], lights[1][q], chosen) * w_i[q, 2]
-        picture = np.pad(picture, ((40, 40), (40, 40), (0, 0)), mode)
-        top, left = int(np.floor(row[q])), int(np.floor(col[q]))
-        y, x = row[q] - top, col[q] - left
-        block = picture[40 + top : 42 + top, 40 + left : 42 + left]
-        out[q] = np.einsum("r,c,rck->k", (1 - y, y), (1 - x, x), block)
-    return out
 
 
 def test_clusters_follow_from_the_bytes(patchy_sample):

@@ -9,15 +9,7 @@ from btfpipe.compression import open_appearance
 from btfpipe.compression.svd import SvdModel, compress_svd, planar_pictures
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
-from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
-
-
-@pytest.fixture(autouse=True)
-def one_blas_thread():
-    """Many BLAS threads on small matrices only wait for each other."""
-    with single_threaded_blas():
-        yield
 
 
 def matrix(appearance):

@@ -9,17 +9,9 @@ from hypothesis import strategies as st
 
 from btfpipe.compression import open_appearance
 from btfpipe.compression.view_pca import ViewPcaModel, compress_view_pca
-from btfpipe.directions import Hemisphere, bonn81, from_angles
+from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
-from btfpipe.parallel import single_threaded_blas
-from btfpipe.sample import Sample, light_cosines
-
-
-@pytest.fixture(autouse=True)
-def one_blas_thread():
-    """Many BLAS threads on small matrices only wait for each other."""
-    with single_threaded_blas():
-        yield
+from btfpipe.sample import Sample
 
 
 def views_of(appearance):
@@ -193,7 +185,7 @@ def test_texels_pictures_and_file_agree(noisy_sample, tmp_path):
 
 @pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
 @pytest.mark.parametrize("toroidal", [True, False])
-def test_the_shader_is_the_formula(noisy_sample, rng, toroidal, interpolation):
+def test_the_shader_is_the_formula(noisy_sample, blended_pictures, rng, toroidal, interpolation):
     precision = "byte" if toroidal else "half"
     sample = noisy_sample(n_views=7, toroidal=toroidal)
     model = compress_view_pca(sample, 3, precision=precision)
@@ -204,29 +196,6 @@ def test_the_shader_is_the_formula(noisy_sample, rng, toroidal, interpolation):
     expected = blended_pictures(model, row, col, w_i, w_o, interpolation)
     assert expected.max() > 0.1
     np.testing.assert_allclose(found, expected, atol=2e-5)
-
-
-def blended_pictures(model, row, col, w_i, w_o, interpolation):
-    """Blend whole pictures over view, and value / cos over light; then four texels."""
-    lights = Hemisphere(model.light_directions, interpolation).weights(w_i)
-    views = Hemisphere(model.view_directions, interpolation).weights(w_o)
-    cosines = light_cosines(model.light_directions)
-    pictures = model.pictures(slice(0, model.n_pairs)).astype(np.float64)
-    pictures = pictures.reshape(len(model.view_directions), len(cosines), *model.shape, 3)
-    pictures = pictures / cosines[:, None, None, None]
-    mode = "wrap" if model.toroidal else "edge"
-    out = np.zeros((len(row), 3))
-    for q in range(len(row)):
-        if w_i[q, 2] <= 0:
-            continue
-        chosen = pictures[np.ix_(views[0][q], lights[0][q])]
-        picture = np.einsum("o,i,oirck->rck", views[1][q], lights[1][q], chosen) * w_i[q, 2]
-        picture = np.pad(picture, ((40, 40), (40, 40), (0, 0)), mode)
-        top, left = int(np.floor(row[q])), int(np.floor(col[q]))
-        y, x = row[q] - top, col[q] - left
-        block = picture[40 + top : 42 + top, 40 + left : 42 + left]
-        out[q] = np.einsum("r,c,rck->k", (1 - y, y), (1 - x, x), block)
-    return out
 
 
 @pytest.mark.parametrize("components", [0, -2])

@@ -130,3 +130,42 @@ def test_another_packing_method_is_named(tmp_path):
     path = pack(tmp_path / "a.zip", {"a.jpg": b"x" * 200}, zipfile.ZIP_LZMA)
     with open_archive(path) as archive, pytest.raises(InputError, match=r"packed by method 14"):
         archive.read("a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("at", "layout", "value"),
+    [
+        (6, "<H", 255),  # version needed to read it
+        (8, "<H", 0x800),  # name in UTF-8, which it then is not
+        (28, "<H", 0),  # length of the name
+        (42, "<I", 0xFFFFFFF0),  # where its local header is
+    ],
+)
+def test_a_directory_with_wrong_bytes_is_refused_by_name(tmp_path, at, layout, value):
+    path = pack(tmp_path / "a.zip", {"\xe9.jpg": b"x" * 200})
+    data = bytearray(path.read_bytes())
+    entry = data.index(b"PK\x01\x02")
+    data[entry + 46] = 0xFF
+    struct.pack_into(layout, data, entry + at, value)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.zip: "):
+        open_archive(path)
+
+
+def test_a_file_longer_than_it_may_be_is_refused_unread(tmp_path):
+    packed = pack(tmp_path / "a.zip", {"b.json": bytes(5000)}, zipfile.ZIP_DEFLATED)
+    (tmp_path / "b.json").write_bytes(bytes(5000))
+    for source in (packed, tmp_path):
+        with open_archive(source) as archive:
+            assert archive.read("b.json", 5000) == bytes(5000)
+            with pytest.raises(
+                InputError, match=r"b\.json: longer than 4999 bytes; expected a list"
+            ):
+                archive.read("b.json", 4999, "a list")
+    with (tmp_path / "huge.jpg").open("wb") as file:
+        file.truncate(2**31)  # a hole, which takes no room
+    with (
+        open_archive(tmp_path) as folder,
+        pytest.raises(InputError, match=r"huge\.jpg: longer than .* expected a picture"),
+    ):
+        folder.read("huge.jpg")

@@ -17,7 +17,8 @@ from btfpipe.compression import open_appearance
 from btfpipe.compression.factored import SPACES, FactoredModel
 from btfpipe.directions import from_angles, ubo2014
 from btfpipe.errors import InputError
-from btfpipe.formats.btf import read_btf, recognise, write_btf
+from btfpipe.formats.btf import read_btf, recognise
+from btfpipe.formats.btf_writing import write_btf
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
 from btfpipe.sample.ingest import ingest
@@ -514,6 +515,23 @@ def test_bdi_is_turned_into_pictures_within_its_memory(put, rng, packing, memory
         assert picture.dtype == np.float16
         np.testing.assert_array_equal(picture, truth[:, :, view, light])
     assert measurement.facts.get("missing_texels", 0) == (packing == 2) * (~mask).sum()
+
+
+@pytest.mark.parametrize("scan_lines", [3, 9])
+@pytest.mark.parametrize("packing", [0, 2])
+def test_the_last_chunk_of_a_bdi_may_be_as_long_as_the_others(put, rng, scan_lines, packing):
+    values = rng.random((ROWS, COLS, len(VIEWS), len(LIGHTS), 3)).astype(np.float16)
+    sections = bdi(values, packing, scan_lines=scan_lines)
+    name, chunk = sections[-1]
+    full = COLS * scan_lines * 3 * N_PAIRS * 2
+    assert len(chunk) < full
+    padded = u32(full) + chunk[4:] + bytes(full - len(chunk) + 4)
+    measurement = read_btf(put([*sections[:-1], (name, padded)]))
+    for pair in range(N_PAIRS):
+        view, light = divmod(pair, len(LIGHTS))
+        np.testing.assert_array_equal(measurement.read(pair), values[:, :, view, light])
+    refuses(put([*sections[:-1], (name, u32(full - 2) + padded[4:-2])]), "chunk .* for")
+    refuses(put([*sections[:-1], (name, padded[:-1])]), "truncated")
 
 
 def test_bdi_may_have_more_chunks_than_a_process_may_have_mappings(put, rng):

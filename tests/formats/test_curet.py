@@ -320,6 +320,7 @@ def test_value_is_pi_radiance_over_the_lamps_irradiance(tmp_path, sample):
         ("1 2\n", "0 rows for sample 5"),
         ("5 1 2\n5 1 2\n", "2 rows for sample 5"),
         ("5 -1 2\n", "gain of sample 5 is -1"),
+        ("5 1 2\n" + " " * (1 << 20), "longer than 1048576 bytes; expected a table"),
     ],
 )
 def test_damaged_calibrations_are_refused_by_name(coated, tmp_path, text, match):

@@ -1,4 +1,5 @@
 import os
+import struct
 
 import numpy as np
 import pytest
@@ -180,3 +181,23 @@ def test_without_nameless_files_plain_ones_serve(rng, monkeypatch):
         for picture in pictures:
             decoded = decoder.decode(encode_picture(picture, ".png"), "a.png")
             np.testing.assert_array_equal(decoded.values, picture)
+
+
+def test_a_small_jpeg_that_declares_many_pixels_is_refused_before_memory_is_taken(rng):
+    data = bytearray(encode_picture(rng.integers(0, 255, (8, 8, 3), np.uint8), ".jpg"))
+    frame = data.index(b"\xff\xc0")
+    data[frame + 5 : frame + 9] = struct.pack(">2H", 16000, 16000)
+    with Decoder() as decoder, pytest.raises(InputError, match=r"16000 x 16000 pixels cannot lie"):
+        decoder.decode(data, "bomb.jpg")
+
+
+def test_the_emptiest_jpeg_is_no_bomb():
+    picture = np.zeros((2000, 2000, 1), np.uint8)
+    assert read_picture(encode_picture(picture, ".jpg", quality=1), "black.jpg").max() < 3
+
+
+def test_a_text_that_is_none_is_refused_by_name(rng):
+    data = encode_picture(rng.random((4, 5, 3)).astype(np.float16), ".exr")
+    assert data.count(b"chlist") == 1
+    with Decoder() as decoder, pytest.raises(InputError, match=r"mine\.exr: truncated or damaged"):
+        decoder.decode(data.replace(b"chlist", b"chl\xffst"), "mine.exr")

@@ -53,6 +53,7 @@ def test_a_product_comes_back_as_that_product(tmp_path, make_sample, target, suf
     assert back.is_product
     assert (back.toroidal, back.texels_per_mm, back.absolute) == (True, 2.5, True)
     assert facts["format"] == "pairs (vectors)"
+    assert facts["n_strays"] == 0
 
 
 @settings(max_examples=10, deadline=None)
@@ -191,6 +192,7 @@ POSITIONS = "name," + ",".join(pairs.COLUMNS["positions"]) + "\n"
         (HEAD.replace("\n", ",name\n") + "a.png,0,0,0,0,b\n", "expected one .csv or .json"),
         ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,0,0,0,1\n", "light of 'a.png'"),
         ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,1,0,0,-1\n", "view of 'a.png'"),
+        ("name,lx,ly,lz,vx,vy,vz\na.png,0,0,1,1e300,0,1\n", "view of 'a.png'"),
         (POSITIONS + "a.png,1,2,0,0,0,9\n", "light of 'a.png'"),
         (POSITIONS + "a.png,1,2,5,0,0,9\n", "--patch-cm"),
     ],

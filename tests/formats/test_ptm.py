@@ -158,10 +158,11 @@ def test_a_wrong_header_is_refused_with_the_reason(tmp_path, kind, old, new, mat
         read_model(tmp_path / "mine")
 
 
-def test_scales_that_are_no_numbers_are_refused(tmp_path):
+@pytest.mark.parametrize("bits", [0x7FC00000, 0x7FA00000, 0x7F800000])  # NaN, a signalling one, inf
+def test_scales_that_are_no_numbers_are_refused(tmp_path, bits):
     data = bytearray(whole("hsh"))
     at = data.index(b"9 2 1\n") + 6
-    data[at : at + 4] = struct.pack("<f", np.nan)
+    data[at : at + 4] = struct.pack("<I", bits)
     (tmp_path / "mine").write_bytes(data)
     with pytest.raises(InputError, match="NaN or infinite"):
         read_model(tmp_path / "mine")

@@ -74,6 +74,7 @@ def test_the_frontal_view_comes_back(tmp_path, make_sample, target, suffix, tole
         ("1\n0 0 1\n", "line 2.*expected a name and x y z"),
         ("1\nfirst light.png 0 0 nan\n", "line 2.*expected a name and x y z"),
         ("1\nfirst light.png 0 0 0\n", "line 2.*expected a name and x y z"),
+        ("1\nfirst light.png 0 0 1e300\n", "line 2.*expected a name and x y z"),
         ("1\nfirst light.png 0 1 -0.1\n", "below the surface"),
         ("2\nfirst light.png 0 0 1\nin/b.PNG 0 0 2\n", "the same light"),
         ("2\nfirst light.png 0 0 1\nFirst light.png 0 1 2\n", "twice"),

@@ -158,6 +158,7 @@ def test_settings_of_a_simulated_set_are_honoured(make_measurement):
         ('{"transfer": "log"}', "transfer is 'log'"),
         ('{"toroidal": 1}', "toroidal is 1"),
         ('{"texels_per_mm": "4"}', "texels_per_mm is '4'"),
+        ('{"white": 1}' + " " * (1 << 20), "longer than 1048576 bytes; expected settings"),
     ],
 )
 def test_wrong_settings_are_refused_by_key(make_measurement, text, match):

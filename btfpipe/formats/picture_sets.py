@@ -1,0 +1,100 @@
+"""What readers of sets share: a folder or zip with one picture a pair, and perhaps settings (``btfpipe.json``)."""
+
+import json
+from pathlib import Path, PurePosixPath
+
+from btfpipe.errors import InputError
+from btfpipe.formats.images import colours, is_mislabelled
+from btfpipe.sample.measurement import Measurement
+from btfpipe.sample.transfer import TRANSFERS
+
+SETTINGS = "btfpipe.json"
+_MOST_SETTINGS = 1 << 20  # bytes
+
+
+def measurement_of_pictures(
+    path, archive, decoder, members, settings, facts, *, curve="srgb", rgb=colours, **tables
+):
+    """Give the pictures of a set as a `Measurement`.
+
+    Parameters
+    ----------
+    path : path-like
+    archive : Folder or Zip
+    decoder : Decoder
+    members : list of str
+        Name in the archive of each pair's picture.
+    settings : dict
+        As in ``btfpipe.json``, checked; what they do not say stays open.
+    facts : dict
+        For the summary; gets ``mislabelled``, the set of members that were.
+    curve : str
+        Transfer curve of pictures with integers, where settings name no other; floats are linear.
+    rgb : function
+        ``rgb(picture, label)`` gives the three colour channels of a `Picture`.
+    **tables
+        Other attributes: directions, their indices, and ``correct``.
+    """
+    labels = [archive.label(name) for name in members]
+    facts["mislabelled"] = set()
+
+    def read(pair):
+        picture = decoder.decode(archive.read(members[pair]), labels[pair])
+        if is_mislabelled(members[pair], picture.suffix):
+            facts["mislabelled"].add(members[pair])
+        return rgb(picture, labels[pair])
+
+    def transfer(picture):
+        return "linear" if picture.dtype.kind == "f" else settings.get("transfer") or curve
+
+    return Measurement(
+        source=Path(path),
+        names=labels,
+        read=read,
+        transfer=transfer,
+        white=settings.get("white"),
+        toroidal=settings.get("toroidal"),
+        texels_per_mm=settings.get("texels_per_mm"),
+        facts=facts,
+        **tables,
+    )
+
+
+def read_settings(archive, name):
+    """Settings of a set that btfpipe wrote, checked."""
+    label = archive.label(name)
+    try:
+        settings = json.loads(archive.read(name, _MOST_SETTINGS, "settings of a set"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{label}: not JSON ({error}).") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{label}: holds no mapping of settings.")
+    return check_settings(settings, label)
+
+
+def beside(member):
+    """Where the settings of a list of pictures are: in its folder."""
+    return (PurePosixPath(member).parent / SETTINGS).as_posix()
+
+
+def settings_beside(archive, member):
+    """Settings beside a list of pictures; none if there is no such file."""
+    name = beside(member)
+    return read_settings(archive, name) if name in archive.names else {}
+
+
+def check_settings(settings, label):
+    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
+    white, transfer = settings.get("white"), settings.get("transfer")
+    density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
+    for key, value in (("white", white), ("texels_per_mm", density)):
+        good = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e30
+        if value is not None and not good:
+            raise InputError(f"{label}: {key} is {value!r}; expected a positive number.")
+    if transfer is not None and transfer not in TRANSFERS:
+        raise InputError(
+            f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."
+        )
+    if toroidal is not None and not isinstance(toroidal, bool):
+        raise InputError(f"{label}: toroidal is {toroidal!r}; expected true or false.")
+    return settings
