@@ -104,6 +104,11 @@ _FORMATS = ("btf", "ptm", "rti", "pairs", "utia", "ubo", "curet", "picture")
     type=FiniteFloat(0, 1, min_open=True),
     help="Reflectance of the grey card, 0 to 1.",
 )
+@click.option(
+    "--cosine",
+    type=click.Choice(["inside", "divided"]),
+    help="Whether values are reflected light, or were divided by the light's cosine.  [default: what SOURCE says, else inside]",
+)
 @click.option("--flatten", is_flag=True, help="Remove slow drift of brightness over the patch.")
 @click.option(
     "--toroidal/--not-toroidal",
@@ -129,6 +134,7 @@ def ingest(source, format_, out, threads, quiet, **options):
     from btfpipe.formats import sources
     from btfpipe.sample.ingest import ingest as ingest_measurement
     from btfpipe.sample.measurement import frontal as nearest_only
+    from btfpipe.sample.measurement import with_cosine
 
     if (options["grey_card"] is None) != (options["grey_card_reflectance"] is None):
         raise click.UsageError("--grey-card and --grey-card-reflectance go together.")
@@ -145,7 +151,10 @@ def ingest(source, format_, out, threads, quiet, **options):
     if "transfer" in takes:
         own["transfer"] = options.pop("transfer")
     own = {key: value for key, value in own.items() if value not in (None, False)}
-    frontal = own.pop("frontal", False) if "frontal" not in takes else False
+    # every format of pictures takes these two; some by themselves
+    frontal, cosine = (
+        own.pop(key, None) if key not in takes else None for key in ("frontal", "cosine")
+    )
     for key in own:
         if key not in takes:
             raise click.UsageError(
@@ -155,11 +164,9 @@ def ingest(source, format_, out, threads, quiet, **options):
     told = {"inputs": [source], "taken_for": name, "because": reason}
     opened = sources.open_source(source, name, **own)
     if isinstance(opened, Model):
-        if frontal:
-            raise click.UsageError(f"{source} is compressed already; --frontal is for pictures.")
         given = [
             key
-            for key, value in options.items()
+            for key, value in (options | {"frontal": frontal, "cosine": cosine}).items()
             if value not in (None, False) or (key == "toroidal" and value is False)
         ]
         if given:
@@ -170,6 +177,8 @@ def ingest(source, format_, out, threads, quiet, **options):
         opened.save(out)
         return told | _facts_of(opened)
     with opened as measurement, progress("pictures", quiet) as report:
+        if cosine == "divided":
+            measurement = with_cosine(measurement)
         if frontal:
             measurement = nearest_only(measurement)
         facts = ingest_measurement(
@@ -183,7 +192,7 @@ def ingest(source, format_, out, threads, quiet, **options):
 
 # Options that some formats take and others do not.
 _OF_FORMATS = (
-    "pairs", "frontal", "directions", "colour", "listing", "patch_cm", "sample_number",
+    "pairs", "frontal", "directions", "colour", "listing", "patch_cm", "sample_number", "cosine",
 )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ Format = namedtuple("Format", "module opener options")
 
 # In the order of asking: the particular before the general.
 FORMATS = {
-    "btf": Format("btfpipe.formats.btf", "read_btf", ()),
+    "btf": Format("btfpipe.formats.btf", "read_btf", ("cosine",)),
     "ptm": Format("btfpipe.formats.ptm", "read_model", ("transfer",)),
     "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
     "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),

@@ -27,7 +27,7 @@ class Measurement:
         ``transfer(picture)`` gives the transfer curve that the format means for a picture read.
     correct : callable or None
         ``correct(pair, picture)`` gives a linear picture (rows, cols, 3) float32 as it would be under one distant light,
-        where the source's lamp stood near. The Sample then holds floating-point values.
+        where the source's lamp stood near, or with the light's cosine inside, where it was divided out. The Sample then holds floating-point values.
     white : float or None
         Decoded value that stands for a perfect white diffuser lit at normal incidence.
     toroidal : bool or None
@@ -95,3 +95,26 @@ def frontal(measurement):
         read=lambda _: measurement.read(pair),
         correct=correct and (lambda _, picture: correct(pair, picture)),
     )
+
+
+def with_cosine(measurement):
+    """A measurement whose values were divided by their light's cosine, with the cosine multiplied in.
+
+    Parameters
+    ----------
+    measurement : Measurement
+
+    Returns
+    -------
+    Measurement
+        With linear pictures in floating point, as our convention has them: see DESIGN.
+    """
+    correct = measurement.correct
+    cosines = np.maximum(measurement.light_directions[measurement.light_index, 2], 0)
+
+    def multiplied(pair, picture):
+        picture = picture if correct is None else correct(pair, picture)
+        return picture * np.float32(cosines[pair])
+
+    measurement.facts["cosine"] = "divided, as asked; multiplied in"
+    return replace(measurement, correct=multiplied)

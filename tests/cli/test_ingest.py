@@ -253,3 +253,43 @@ def test_the_frontal_pair_is_taken_of_any_format(btfpipe, make_sample, tmp_path)
     write_picture(tmp_path / "p.png", np.zeros((4, 5, 3), np.uint8))
     btfpipe("ingest", tmp_path / "p.png", "--frontal", "-o", tmp_path / "p.npz")
     assert Sample.open(tmp_path / "p.npz").shape == (4, 5)
+
+
+def test_a_cosine_that_was_divided_out_is_multiplied_in(btfpipe, make_sample, tmp_path):
+    from btfpipe.directions import bonn81
+    from btfpipe.sample import Sample
+
+    sample = make_sample(6, 8, lights=bonn81()[:19], views=bonn81()[:3])
+    cosine = sample.light_directions[sample.light_index, 2]
+    divided = Sample(
+        (sample.codes / cosine[:, None, None, None]).astype(np.float32), sample.light_directions,
+        sample.view_directions, sample.light_index, sample.view_index,
+    )  # fmt: skip
+    for name, some in (("inside", sample), ("divided", divided)):
+        some.save(tmp_path / f"{name}.npz")
+        for format_ in ("pairs", "ubo"):
+            target = tmp_path / f"{name}.{format_}.zip"
+            btfpipe("export", tmp_path / f"{name}.npz", "--format", format_, "--suffix", ".exr", "-o", target)  # fmt: skip
+            out = tmp_path / f"{name}.{format_}.npz"
+            done = btfpipe("ingest", target, "--cosine", name, "--json", "-o", out)
+            assert ("multiplied in" in done.stdout) == (name == "divided")
+            found = Sample.open(out)
+            np.testing.assert_allclose(
+                found.pictures(slice(None)), sample.pictures(slice(None)), rtol=2e-3, atol=1e-6
+            )
+    btfpipe("ingest", target, "--cosine", "divided", "--frontal", "-o", tmp_path / "one.npz")
+    assert Sample.open(tmp_path / "one.npz").n_pairs == 1
+
+
+def test_the_cosine_flag_of_a_model_file_is_overruled(btfpipe, make_sample, tmp_path):
+    from btfpipe.compression import open_appearance
+
+    make_sample(6, 8).save(tmp_path / "s.npz")
+    btfpipe("export", tmp_path / "s.npz", "--format", "btf", "-o", tmp_path / "s.btf")
+    for name in ("inside", "divided"):
+        btfpipe("ingest", tmp_path / "s.btf", "--cosine", name, "-o", tmp_path / f"{name}.npz")
+    one, other = (open_appearance(tmp_path / f"{name}.npz") for name in ("inside", "divided"))
+    cosine = one.light_directions[one.light_index, 2][:, None, None, None]
+    np.testing.assert_allclose(
+        other.pictures(slice(None)), one.pictures(slice(None)) * cosine, rtol=1e-3, atol=1e-5
+    )

@@ -12,7 +12,7 @@ from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_pca import LocalPcaModel, compress_local_pca
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
-from btfpipe.sample import Sample, light_cosines
+from btfpipe.sample import Sample
 from btfpipe.sample.resample import Resampled
 
 
