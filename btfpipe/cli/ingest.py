@@ -198,7 +198,8 @@ _OF_FORMATS = (
 
 def _facts_of(model):
     """What a summary says of a Model that came from a file."""
-    return {
+    source = model.about.get("source", {})
+    return {key: source[key] for key in ("cosine",) if key in source} | {
         "kind": "model",
         "method": model.method,
         "rows": model.shape[0],
