@@ -1,5 +1,7 @@
 """Double spherical harmonics against least squares by numpy, a lambda by bisection, and functions they hold exactly."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -32,14 +34,20 @@ def smooth_sample(rng, rows=3, cols=40, n=5, noise=0.0):
     return product_sample(values, directions, directions)
 
 
-def naive(values, basis, n_steps=200):
+def squared_cosines(directions):
+    """Weights of the views, of mean 1."""
+    return directions[:, 2] ** 2 / (directions[:, 2] ** 2).mean()
+
+
+def naive(values, basis, weights, n_steps=200):
     """Coefficients of one vector: the least lambda within the energy, by bisection over plain solves."""
     energy = 4 * np.pi / len(values) * (values**2).sum()
-    gram, right = basis.T @ basis, basis.T @ values
+    gram, right = basis.T @ np.diag(weights) @ basis, basis.T @ (weights * values)
 
     def solve(penalty):
         if penalty == 0:
-            return np.linalg.lstsq(basis, values, rcond=1e-6)[0]
+            root = np.sqrt(weights)
+            return np.linalg.lstsq(root[:, None] * basis, root * values, rcond=1e-6)[0]
         return np.linalg.solve(gram + penalty * np.eye(len(gram)), right)
 
     coefficients = solve(0)
@@ -104,11 +112,13 @@ def test_functions_of_few_harmonics_come_back_but_for_the_codes(rng):
 def test_each_vector_is_that_of_a_bisection(rng, noise):
     directions = bonn81()
     values = smooth_sample(rng, 1, 3, noise=noise).pictures(slice(0, 81)).reshape(1, 81, 9)
-    for terms in (4, 16, 25):
-        fit = _Fit(directions, terms, "lights", None)
+    for terms, weights in itertools.product(
+        (4, 16, 25), (np.ones(81), squared_cosines(directions))
+    ):
+        fit = _Fit(directions, terms, "lights", None, weights)
         basis = spherical_harmonics(directions, terms)
         found = fit.apply(values)[0]
-        expected = np.stack([naive(v.astype(float), basis) for v in values[0].T], axis=1)
+        expected = np.stack([naive(v.astype(float), basis, weights) for v in values[0].T], axis=1)
         np.testing.assert_allclose(basis @ found, basis @ expected, atol=2e-4 * values.max())
         np.testing.assert_allclose(found, expected, atol=2e-2 * np.abs(expected).max())
 
@@ -139,15 +149,15 @@ def test_scaled_values_have_scaled_coefficients(rng):
 
 
 def test_the_whole_is_that_of_a_loop_over_texels(rng):
-    """Views first, then lights, a vector at a time, without codes."""
+    """Views first, weighted by their squared cosines, then lights, a vector at a time, without codes."""
     sample = smooth_sample(rng, 2, 2, noise=0.02)
     model = compress_harmonics(sample, 9, 16)
     values = whole(sample).reshape(81, 81, 2, 2, 3)
     views, lights = (spherical_harmonics(bonn81(), n) for n in (9, 16))
     for row, col, channel in ((0, 0, 0), (1, 0, 2), (1, 1, 1)):
         matrix = values[:, :, row, col, channel].astype(float)
-        by_light = np.stack([naive(f, views) for f in matrix.T], axis=1)
-        both = np.stack([naive(f, lights) for f in by_light])
+        by_light = np.stack([naive(f, views, squared_cosines(bonn81())) for f in matrix.T], axis=1)
+        both = np.stack([naive(f, lights, np.ones(81)) for f in by_light])
         found = model.texels([row], [col])[0, :, channel].reshape(81, 81)
         assert np.abs(found - views @ both @ lights.T).max() < worst_step(model) + 1e-3
 
@@ -156,9 +166,12 @@ def test_one_penalty_for_all_is_ridge_regression(rng):
     sample = smooth_sample(rng, 1, 2)
     model = compress_harmonics(sample, 9, 9, penalty=0.5)
     basis = spherical_harmonics(bonn81(), 9)
-    ridge = np.linalg.solve(basis.T @ basis + 0.5 * np.eye(9), basis.T)
+    seen, lit = (
+        np.linalg.solve(basis.T * weights @ basis + 0.5 * np.eye(9), basis.T * weights)
+        for weights in (squared_cosines(bonn81()), np.ones(81))
+    )
     values = whole(sample).reshape(81, 81, 6).astype(float)
-    expected = np.einsum("iv,jl,vla->aij", ridge, ridge, values).reshape(1, 2, 3, 9, 9)
+    expected = np.einsum("iv,jl,vla->aij", seen, lit, values).reshape(1, 2, 3, 9, 9)
     found = model.coefficients(slice(None), slice(None))
     assert (np.abs(found - expected) <= 0.51 * model.step() + 1e-5).all()
     assert model.about["penalty"] == 0.5
