@@ -17,6 +17,7 @@ import math
 import os
 import stat
 import struct
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -134,6 +135,30 @@ def _plain(thing):
     raise TypeError(f"{type(thing).__name__} has no JSON form")
 
 
+def scratch(shape, dtype):
+    """An array of zeros, mapped from a temporary file without a name that goes when the array does.
+
+    For results too large to be kept in memory until they are written. The folder is that of `tempfile`: the
+    environment variable TMPDIR chooses it.
+
+    Raises
+    ------
+    InputError
+        If the folder has no room for it.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with tempfile.TemporaryFile() as file:
+        try:
+            # a mapped file that runs out of room ends the program, without a word
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for a temporary file of {math.ceil(size / (1 << 20))} MB"
+                f" ({error.strerror}); make room there, choose another folder by TMPDIR, or raise --memory."
+            ) from error
+        return np.memmap(file, dtype, "r+", shape=tuple(shape))
+
+
 class Writer:
     """Writes the members of a container one after the other, streaming.
 
@@ -147,9 +172,11 @@ class Writer:
 
     def array(self, name, array):
         """Write one array as member `name`."""
-        array = np.ascontiguousarray(array)
+        array = np.asarray(array)
         with self.stream(name, array.shape, array.dtype) as put:
-            put(array)
+            # what lies in another order is copied part by part
+            for part in [array] if array.flags.c_contiguous else array:
+                put(part)
 
     @contextlib.contextmanager
     def stream(self, name, shape, dtype):

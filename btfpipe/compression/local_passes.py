@@ -5,7 +5,12 @@ import math
 
 import numpy as np
 
-from btfpipe.compression.svd import _PROCESS_BYTES, _require_range, planar_pictures
+from btfpipe.compression.svd import (
+    _PROCESS_BYTES,
+    LEAST_PICTURES,
+    _require_range,
+    planar_pictures,
+)
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map
 
@@ -27,7 +32,7 @@ def plan(samples, clusters, components, precision, threads, memory):
     Only the first has a part in the result, and it depends on the samples alone.
     """
     pairs, texels = samples[0].n_pairs, sum(math.prod(sample.shape) for sample in samples)
-    step = max(1, _DECODED_BYTES // (12 * texels))
+    step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * texels))
     step = min(step, math.ceil(pairs / _GROUPS))
     width = components + OVERSAMPLING
     basis, coordinate = (dtype.itemsize for dtype in TYPES[precision])

@@ -14,7 +14,7 @@ import numpy as np
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_passes import OVERSAMPLING, REDUCED_TERMS, TYPES, Passes, plan
 from btfpipe.compression.model import Model, measured_error
-from btfpipe.compression.svd import compress_svd
+from btfpipe.compression.svd import factorise
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, single_threaded_blas
 
@@ -414,15 +414,16 @@ def _reduced(samples, names, seed, threads, memory, progress):
     textures, angular = [], []
     for sample, name in zip(samples, names, strict=True):
         try:
-            model = compress_svd(
-                sample, REDUCED_TERMS, iterations=1, precision="single", seed=seed, threads=threads,
-                memory=memory, on_progress=progress.part(3 * sample.n_pairs),
+            texture, weights, facts = factorise(
+                sample, REDUCED_TERMS, measure=False, iterations=1, precision="single", seed=seed,
+                threads=threads, memory=memory, on_progress=progress.part(3 * sample.n_pairs),
             )  # fmt: skip
         except InputError as error:
             raise InputError(f"{name}: {error}" if len(samples) > 1 else str(error)) from error
-        root = np.sqrt(np.array(model.about["singular_values"])).astype(np.float32)
-        textures.append((model.texture_factors.reshape(-1, model.n_terms), root))
-        angular.append((model.angular_factors.reshape(-1, model.n_terms), root))
+        root = np.sqrt(np.array(facts["singular_values"])).astype(np.float32)
+        textures.append((texture, root))
+        if len(samples) > 1:
+            angular.append((weights.reshape(-1, len(root)), root))
     if len(samples) == 1:
         points = textures[0][0] * textures[0][1]
     else:

@@ -23,6 +23,8 @@ from btfpipe.sample.transfer import decode_table
 _OVERSAMPLING = 10
 _GROUPS = 32  # partial sums a pass, added in order; fixed, so that threads and memory never show
 _DECODED_BYTES = 6 << 20  # linear pictures in a thread's hands; fixed, as sums hang on it
+LEAST_PICTURES = 8  # in a thread's hands, however large: products with fewer only wait for memory
+_TEXELS = 1 << 14  # whose sums are added at a time; fixed
 _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
 _MOST_ITERATIONS = 8
@@ -319,16 +321,15 @@ class _Passes:
         self.total, self.on_progress = total, on_progress
         self.texels = sample.shape[0] * sample.shape[1]
         # pictures decoded at a time
-        self.step = max(1, _DECODED_BYTES // (12 * self.texels))
+        self.step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * self.texels))
         self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
         # basis, its successor and QR's copies; the weights, and in double precision
         vectors = 4 * width * self.texels  # one array of as many columns as the subspace
         # the weights, also in double precision and turned; then what QR takes, or a pass
         fixed = _PROCESS_BYTES + 4 * width * 6 * channels * sample.n_pairs
-        each = (
-            2 * vectors + 36 * self.step * self.texels
-        )  # two partial sums; pictures being decoded
+        each = vectors + 36 * self.step * self.texels  # a partial sum; pictures being decoded
+        each += 4 * width * min(_TEXELS, self.texels)
         need = fixed + max(7 * vectors, 4 * vectors + each)
         if need > memory:
             raise InputError(
@@ -372,11 +373,12 @@ class _Passes:
         energy = 0.0
 
         def work(steps):
-            parts, sum_, share, squares = [], np.zeros_like(image), np.empty_like(image), 0.0
+            parts, sum_, squares = [], np.zeros_like(image), 0.0
             for pairs in steps:
                 values = self.rows(self.sample, pairs)
                 parts.append(values @ basis)
-                sum_ += np.matmul(values.T, parts[-1], out=share)
+                for some in blocks(self.texels, _TEXELS):
+                    sum_[some] += values[:, some].T @ parts[-1]
                 squares += _squares(values)
             return np.concatenate(parts), sum_, squares
 
@@ -407,16 +409,25 @@ def _squares(values):
     return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
-def planar_pictures(sample, pairs):
-    """Linear pictures as rows (pairs * 3, texels) float32, a channel a row; 8-bit codes by table."""
+def planar_pictures(sample, pairs, lines=slice(None)):
+    """Linear pictures as rows (pairs * 3, texels) float32, a channel a row; 8-bit codes by table.
+
+    Of the texels, those of some scan lines (a slice); of a Sample, no others are read.
+    """
     codes = getattr(sample, "codes", None)
-    if codes is None or codes.dtype != np.uint8 or sample.gain is not None:
-        values = sample.pictures(pairs)
-        return np.ascontiguousarray(values.transpose(0, 3, 1, 2)).reshape(3 * len(values), -1)
-    codes = np.asarray(codes[pairs]).reshape(-1, sample.shape[0] * sample.shape[1], 3)
-    values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
-    decode_planar(codes, decode_table(np.uint8, sample.transfer, sample.scale), values)
-    return values.reshape(3 * len(codes), -1)
+    if codes is not None and codes.dtype == np.uint8 and sample.gain is None:
+        codes = np.ascontiguousarray(codes[pairs, lines])
+        codes = codes.reshape(len(codes), -1, 3)
+        values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
+        decode_planar(codes, decode_table(np.uint8, sample.transfer, sample.scale), values)
+        return values.reshape(3 * len(codes), -1)
+    if codes is None:
+        values = sample.pictures(pairs)[:, lines]
+    else:
+        values = sample.decode(np.asarray(codes[pairs, lines]))
+        if sample.gain is not None:
+            values = values * sample.gain[lines]
+    return np.ascontiguousarray(values.transpose(0, 3, 1, 2)).reshape(3 * len(values), -1)
 
 
 @njit(cache=True, nogil=True)
