@@ -1,6 +1,7 @@
 import io
 import json
 import struct
+import tempfile
 import zipfile
 
 import numpy as np
@@ -109,6 +110,28 @@ def test_streaming_equals_writing_at_once(path, tmp_path):
         for name in ("half", "empty", "scalar"):
             writer.array(name, ARRAYS[name])
     assert path.read_bytes() == (tmp_path / "s.npz").read_bytes()
+
+
+def test_arrays_in_any_order_of_memory_are_written_alike(path, tmp_path, rng):
+    wide = rng.random((5, 8, 6))
+    arrays = {
+        "part": wide[:, :3],
+        "turned": wide.T,
+        "line": wide[0, 0],
+        "every other": wide[::2, 0, 1],
+    }
+    store.write(path, "sample", arrays)
+    store.write(tmp_path / "b.npz", "sample", {k: a.copy(order="C") for k, a in arrays.items()})
+    assert path.read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_scratch_array_is_zero_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    array = store.scratch((3, 4), np.int16)
+    assert list(tmp_path.iterdir()) == []
+    assert not array.any()
+    array[1] = 7
+    assert array.sum() == 28
 
 
 @pytest.mark.parametrize("blocks", [[], [3], [5]])
