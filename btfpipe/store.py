@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 import math
+import mmap
 import os
 import stat
 import struct
@@ -157,6 +158,27 @@ def scratch(shape, dtype):
                 f" ({error.strerror}); make room there, choose another folder by TMPDIR, or raise --memory."
             ) from error
         return np.memmap(file, dtype, "r+", shape=tuple(shape))
+
+
+def will_read(array, part):
+    """Ask the system for ``array[:, part]`` of a mapped array, and for nothing around it.
+
+    Left to itself it reads on behind every place that is touched: for a few scan lines of all pictures nearly the whole file,
+    and again for the next few if the file is larger than memory. Of an array in memory nothing is asked.
+    """
+    mapped = array.base
+    if isinstance(mapped, mmap.mmap) and hasattr(mapped, "madvise"):
+        for start, length in _pages(array, part):
+            mapped.madvise(mmap.MADV_WILLNEED, start, length)
+
+
+def _pages(array, part):
+    """Start and length, in bytes of the mapped file, of ``array[i, part]`` for each i, from whole pages on."""
+    size, line = array.strides[:2]
+    first = array.offset % mmap.ALLOCATIONGRANULARITY + part.start * line
+    for start in range(first, first + len(array) * size, size):
+        page = start // mmap.PAGESIZE * mmap.PAGESIZE
+        yield page, start + (part.stop - part.start) * line - page
 
 
 class Writer:

@@ -1,5 +1,6 @@
 import io
 import json
+import mmap
 import struct
 import tempfile
 import zipfile
@@ -132,6 +133,22 @@ def test_a_scratch_array_is_zero_and_leaves_no_file(tmp_path, monkeypatch):
     assert not array.any()
     array[1] = 7
     assert array.sum() == 28
+
+
+def test_the_bytes_asked_for_are_those_of_the_part(path, rng):
+    array = rng.integers(0, 255, (7, 40, 50, 3)).astype(np.uint8)
+    store.write(path, "sample", {"before": np.zeros(5001, np.uint8), "pictures": array})
+    mapped = store.read(path)["pictures"]
+    for part in (slice(0, 3), slice(11, 12), slice(38, 40), slice(0, 40)):
+        store.will_read(mapped, part)
+        store.will_read(array, part)
+        ranges = list(store._pages(mapped, part))
+        assert len(ranges) == 7
+        for (start, length), picture in zip(ranges, array, strict=True):
+            assert start % mmap.PAGESIZE == 0
+            found = mapped.base[start : start + length]
+            assert found.endswith(picture[part].tobytes())
+            assert len(found) < picture[part].nbytes + mmap.PAGESIZE
 
 
 @pytest.mark.parametrize("blocks", [[], [3], [5]])

@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numba import njit
 
+from btfpipe import store
 from btfpipe.compression.model import Model
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
@@ -412,6 +413,7 @@ class _Lines:
             values = self.sample.texels(rows, cols)
             values = values.reshape(-1, self.cols, self.sample.n_pairs, 3).swapaxes(1, 2)
             return np.ascontiguousarray(values)
+        store.will_read(self.sample.codes, band)
         codes = np.ascontiguousarray(self.sample.codes[:, band].swapaxes(0, 1))
         if self.table is not None:
             return codes
