@@ -13,7 +13,7 @@ from numba import njit
 
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
-_POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
+POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
 _MANY, _EACH = 1 << 16, 128  # more points than the first, and than so many a cluster, are too many
 _LAST = 3  # rounds over all points then
 _STARTS = 3  # the best of so many: the outcome varies by some per cent with the first means
@@ -135,7 +135,7 @@ def _assign(points, means, bases, threads):
         _nearest(some @ frame, mean_squares, offsets, ends, labels, errors)
         return labels, errors
 
-    results = list(ordered_map(work, blocks(len(points), _POINTS), threads))
+    results = list(ordered_map(work, blocks(len(points), POINTS), threads))
     labels, errors = (np.concatenate(parts) for parts in zip(*results, strict=True))
     _fill_empty(labels, errors, clusters)
     return labels, float(errors.sum())

@@ -12,7 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfpipe.compression.local_clusters import local_clusters
-from btfpipe.compression.local_passes import OVERSAMPLING, REDUCED_TERMS, TYPES, Passes, plan
+from btfpipe.compression.local_passes import (
+    JOINT_TERMS,
+    OVERSAMPLING,
+    REDUCED_TERMS,
+    TYPES,
+    Passes,
+    plan,
+)
 from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise
 from btfpipe.errors import InputError
@@ -22,7 +29,6 @@ from btfpipe.parallel import blocks, single_threaded_blas
 # this gives 16 clusters to a sample of 128 x 128 texels and 81 x 81 directions, and 250 to fifteen with 151 x 151,
 # the numbers of the paper.
 DEFAULT_RATIO = 54
-_JOINT_TERMS = 512  # of several samples together
 _DIRECTIONS = ("light_directions", "view_directions", "light_index", "view_index")
 _FACTS = ("toroidal", "texels_per_mm", "absolute")
 
@@ -435,7 +441,7 @@ def _reduced(samples, names, seed, threads, memory, progress):
                 gram += some.T @ some
             del angular
             values, turn = np.linalg.eigh(gram)
-            kept = np.flatnonzero(values[::-1][:_JOINT_TERMS] > 1e-9 * max(values[-1], 1e-300))
+            kept = np.flatnonzero(values[::-1][:JOINT_TERMS] > 1e-9 * max(values[-1], 1e-300))
             values, turn = values[::-1][kept], turn[:, ::-1][:, kept]
             turn = turn * np.sqrt(values)
             parts = []

@@ -219,7 +219,7 @@ def test_threads_and_memory_never_show(patchy_sample):
     samples = [patchy_sample(shape=(50, 47)), patchy_sample(shape=(12, 15))]
     models = [
         compress_local_pca(samples, clusters=7, components=3, threads=threads, memory=memory)
-        for threads, memory in ((1, 2 << 30), (2, 2 << 30), (3, 114 << 20))
+        for threads, memory in ((1, 2 << 30), (2, 2 << 30), (3, 116 << 20))
     ]
     for model in models[1:]:
         for name, array in model.arrays().items():
