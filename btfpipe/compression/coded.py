@@ -22,7 +22,7 @@ import numpy as np
 
 from btfpipe import store
 from btfpipe.compression.entropy import decode_planes, encode_planes
-from btfpipe.compression.model import Model, measured_error, tables
+from btfpipe.compression.model import Model, comparison_bytes, measured_error, tables
 from btfpipe.compression.svd import SvdModel, factorise
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
@@ -181,7 +181,7 @@ def compress_coded(
         n_terms = max(_TERMS, plain, min(12 * plain, 2 * _TERMS))
     most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
     # factors, transformed, quantised, with what that takes, and unpacked again
-    need = (104 << 20) + 4 * 7 * most * lengths
+    need = (104 << 20) + 4 * 4 * most * lengths + comparison_bytes(sample)
     if need > memory:
         raise InputError(
             f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
@@ -271,7 +271,8 @@ class _Packer:
         weight[weight == 0] = 1
         self.singular = (weight**2).astype(np.float32)
         weight = weight.astype(np.float32)[:, None, None]
-        self.texture = dctn(texture, axes=(1, 2), norm="ortho") * weight
+        self.texture = dctn(texture, axes=(1, 2), norm="ortho")
+        self.texture *= weight
         angular = factors.angular_factors.transpose(2, 0, 1) * weight
         colour = _principal_axes(angular, 2)
         self.tables = {"colour": colour}
@@ -355,7 +356,8 @@ def _quantise(values, step):
     sizes = np.abs(values)
     sizes *= 1 / step
     sizes += _ROUND
-    return np.copysign(np.floor(sizes, out=sizes), values).astype(np.int32)
+    np.floor(sizes, out=sizes)
+    return np.copysign(sizes, values, out=sizes).astype(np.int32)
 
 
 def _live(planes, axis, least=1):

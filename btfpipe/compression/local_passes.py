@@ -62,8 +62,8 @@ def _reduced_bytes(samples, directions):
     terms = min(REDUCED_TERMS, max(texels), rows)
     several = len(samples) > 1
     kept = 4 * terms * (sum(texels) + rows * len(samples) * several)
-    # seven arrays of the largest one's columns, and six of the weights
-    last = 4 * (terms + 10) * (7 * max(texels) + 6 * rows)
+    # four arrays of the largest one's columns, and six of the weights
+    last = 4 * (terms + 10) * (4 * max(texels) + 6 * rows)
     points = 4 * sum(texels) * (min(JOINT_TERMS, terms * len(samples)) if several else terms)
     gram = 24 * (terms * len(samples)) ** 2 * several
     return (

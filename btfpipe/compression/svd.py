@@ -208,7 +208,8 @@ def factorise(
     with single_threaded_blas():
         basis = rng.standard_normal((texels, width), np.float32)
         for _ in range(_FIRST_PASSES):
-            basis = passes.power(_orthonormal(basis), first)[1]
+            basis = _orthonormal(basis)
+            basis = passes.power(basis, first)[1]
         shift = 0.0
         for iteration in range(most_passes):
             basis = _orthonormal(basis)
@@ -222,13 +223,16 @@ def factorise(
             if (iterations is None and excess <= _GOOD_ENOUGH) or iteration + 1 == most_passes:
                 break
             shift = max(shift, float(values[-1]) / 2)
-            basis = image - np.float32(shift) * basis
+            basis *= np.float32(shift)
+            image -= basis
+            basis, image = image, None  # four arrays of this size are all there may be
         singular = np.sqrt(values[:n_terms])
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
         root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
         texture = basis @ (turn * root).astype(np.float32)
         angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
+        del basis, image
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
         texture, angular = texture.astype(dtype), angular.astype(dtype)
@@ -291,9 +295,11 @@ def _excess(basis, image, values, turn, energy):
     """
     width = basis.shape[1]
     kept = values[: turn.shape[1]]
-    residual = image @ turn.astype(np.float32)
-    residual -= (basis @ turn.astype(np.float32)) * kept.astype(np.float32)
-    squares = np.square(residual, dtype=np.float64).sum(axis=0)
+    turn, squares = turn.astype(np.float32), 0.0
+    for some in blocks(len(basis), _TEXELS):
+        residual = image[some] @ turn
+        residual -= (basis[some] @ turn) * kept.astype(np.float32)
+        squares = squares + np.square(residual, dtype=np.float64).sum(axis=0)
     outside = values[-1] if width > turn.shape[1] else 0.0
     rounding = 1e-7 * energy
     error = max(energy - kept.sum(), 0.0)
@@ -324,19 +330,18 @@ class _Passes:
         self.step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * self.texels))
         self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
-        # basis, its successor and QR's copies; the weights, and in double precision
         vectors = 4 * width * self.texels  # one array of as many columns as the subspace
         # the weights, also in double precision and turned; then what QR takes, or a pass
         fixed = _PROCESS_BYTES + 4 * width * 6 * channels * sample.n_pairs
         each = vectors + 36 * self.step * self.texels  # a partial sum; pictures being decoded
         each += 4 * width * min(_TEXELS, self.texels)
-        need = fixed + max(7 * vectors, 4 * vectors + each)
+        need = fixed + max(4 * vectors, 2 * vectors + each)
         if need > memory:
             raise InputError(
                 f"{width} vectors of {self.texels} texels need {math.ceil(need / (1 << 20))} MB; --memory"
                 f" allows {memory >> 20} MB. Raise it, or ask for fewer components."
             )
-        self.at_once = int(min((memory - fixed - 4 * vectors) // each, 2 * threads))
+        self.at_once = int(min((memory - fixed - 2 * vectors) // each, 2 * threads))
         self.threads = min(threads, self.at_once)
 
     def _groups(self, work, chosen=None):
@@ -390,7 +395,7 @@ class _Passes:
 
     def squared_error(self, texture, angular):
         """Sum of squared differences between the matrix and the product of its stored factors."""
-        texture = np.asarray(texture, np.float32).T.copy()
+        texture = np.ascontiguousarray(texture.T, np.float32)
 
         def work(steps):
             total = 0.0
