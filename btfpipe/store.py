@@ -151,7 +151,8 @@ def scratch(shape, dtype):
     with tempfile.TemporaryFile() as file:
         try:
             # a mapped file that runs out of room ends the program, without a word
-            os.posix_fallocate(file.fileno(), 0, size)
+            reserve = getattr(os, "posix_fallocate", None)  # macOS has none
+            reserve(file.fileno(), 0, size) if reserve else file.truncate(size)
         except OSError as error:
             raise InputError(
                 f"{tempfile.gettempdir()}: no room for a temporary file of {math.ceil(size / (1 << 20))} MB"
