@@ -1,7 +1,7 @@
 """What every command shares: options, summary, progress, exit codes.
 
 Exit codes: 0 done, 1 unforeseen (with traceback), 2 wrong usage or configuration, 3 unusable input,
-4 numerical failure.
+4 numerical failure, 128 + n if signal n ended it.
 """
 
 import contextlib
