@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
 from btfpipe.errors import InputError
 
 
@@ -71,6 +71,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         threads=threads,
         seed=seed,
     )
+    refuse_inputs(out, loaded.files)
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:

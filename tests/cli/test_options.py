@@ -109,6 +109,17 @@ def test_an_input_is_never_an_output_even_with_force(tmp_path):
     assert (tmp_path / "a").read_text() == "mine"
 
 
+def test_a_folder_with_the_input_is_never_an_output(tmp_path):
+    (tmp_path / "set/below").mkdir(parents=True)
+    (tmp_path / "set/below/a").write_text("mine")
+    done = []
+    made = command(lambda out: done.append(out), folder=True)
+    result = run(made, tmp_path / "set/below/a", "-o", tmp_path / "set", "--force")
+    assert result.exit_code == 2
+    assert "holds the input" in result.stderr
+    assert not done
+
+
 def test_a_sample_does_not_replace_itself_by_its_model(btfpipe, make_sample, tmp_path):
     path = tmp_path / "s.npz"
     make_sample().save(path)

@@ -510,6 +510,15 @@ def test_unusable_map_is_refused_by_key(values, light, message, scene_file, btfp
     assert not (tmp_path / "p.exr").exists()
 
 
+def test_picture_never_replaces_its_own_environment(scene_file, btfpipe, tmp_path):
+    write_picture(tmp_path / "room.exr", _with(1))
+    before = (tmp_path / "room.exr").read_bytes()
+    path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.exr"}])
+    done = btfpipe("render", path, "-o", tmp_path / "room.exr", "--force", code=2)
+    assert "room.exr is also the input" in done.stderr
+    assert (tmp_path / "room.exr").read_bytes() == before
+
+
 def test_picture_of_codes_is_no_environment(scene_file, btfpipe, tmp_path):
     write_picture(tmp_path / "room.png", np.zeros((4, 8, 3), np.uint8))
     path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.png"}])
