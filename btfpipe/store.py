@@ -22,6 +22,7 @@ import secrets
 import shutil
 import stat
 import struct
+import tokenize
 import zipfile
 from pathlib import Path
 
@@ -34,6 +35,8 @@ ALIGNMENT = 64
 FORMAT_VERSION = 1
 _PADDING_ID = 0xD935  # the extra-field id that alignment tools for zip files use
 _ABOUT = "about.json"
+# What numpy raises of a header with wrong bytes, and reading of a file that ends early.
+_BROKEN = (ValueError, TypeError, SyntaxError, tokenize.TokenError, OSError, EOFError, struct.error)
 
 
 @contextlib.contextmanager
@@ -384,7 +387,7 @@ class Reader:
             raise InputError(f"{self.path}: holds no array {name!r}; it has {self.names()}.")
         try:
             return self._map(info)
-        except (ValueError, OSError, EOFError, struct.error) as error:
+        except _BROKEN as error:
             raise InputError(f"{self.path}: array {name!r} is damaged ({error}).") from error
 
     def _map(self, info):

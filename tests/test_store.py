@@ -270,6 +270,8 @@ def test_damage_in_a_header_is_refused_by_array(path):
         (start, b"XX"),
         (data.index(b"\x93NUMPY"), b"XXXXXX"),
         (data.index(b"(2, 3, 4)"), b"(9, 9, 9)"),
+        (data.index(b"(2, 3, 4)"), b"(2, 3(, 4"),
+        (data.index(b"(2, 3, 4)"), b"(2, 3, ''"),
     ):
         spoiled = bytearray(data)
         spoiled[place : place + len(value)] = value
