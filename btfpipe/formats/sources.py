@@ -3,9 +3,10 @@
 import contextlib
 import importlib
 from collections import namedtuple
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from btfpipe.formats.archive import is_zip
+from btfpipe.formats.archive import is_zip, names_in
+from btfpipe.formats.picture_sets import SETTINGS
 from btfpipe.sample.measurement import Measurement
 
 # A format that can be read. `module` holds recognise(path), which gives a reason in words or None, and `opener`: a context manager that
@@ -27,17 +28,31 @@ FORMATS = {
 }
 
 
+_LISTS = {".lp": "rti", ".csv": "pairs", ".json": "pairs"}  # endings of lists of directions
+
+
 def recognise(path):
     """The format of a file, folder or zip, and why: (str, str).
 
-    What nothing recognises is taken for the most general format of its kind, whose reader says what is wrong with it.
+    What nothing recognises is taken for the format that a list in it ends like, or else for the most general format of its
+    kind, whose reader says what is wrong with it.
     """
     for name, format_ in FORMATS.items():
         reason = importlib.import_module(format_.module).recognise(path)
         if reason:
             return name, reason
+    names = [name for name in names_in(path) or [Path(path).name] if _is_seen(name)]
+    for ending, format_ in _LISTS.items():
+        lists = [name for name in names if name.lower().endswith(ending)]
+        if lists:
+            return format_, f"nothing else fits, and {lists[0]} is there"
     general = "ubo" if Path(path).is_dir() or is_zip(path) else "picture"
     return general, "no format fits"
+
+
+def _is_seen(name):
+    base = PurePosixPath(name).name
+    return not base.startswith(".") and base != SETTINGS and "__MACOSX/" not in name
 
 
 def open_source(path, name, **options):
