@@ -35,7 +35,7 @@ def _bindings(context, parameter, values):
     "--float",
     "full",
     is_flag=True,
-    help="Store all layers as 32-bit floats; colours, alpha and normals are 16-bit otherwise.",
+    help="Store all layers as 32-bit floats; otherwise colours, alpha and normals are 16-bit, unless radiance exceeds those.",
 )
 @stage()
 def render(scene, bindings, width, height, samples, full, out, seed, threads, memory, quiet):
@@ -50,6 +50,8 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
       btfpipe render turntable.yaml --bind model=wool.model.npz --bind map=wool.map.npz -o wool.exr
     """
     import time
+
+    import numpy as np
 
     from btfpipe.formats.images import colours, open_picture, write_picture
     from btfpipe.formats.meshes import read_mesh
@@ -77,8 +79,20 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     with progress("render", quiet) as report:
         picture = render_scene(loaded, seed=seed, threads=threads, on_progress=report)
     render_seconds = time.perf_counter() - start
-    half = [not full and name[0] in "RGBAN" for name in LAYERS]
+    largest = float(np.abs(picture[..., :3]).max())
+    if not np.isfinite(largest):
+        raise InputError(f"{scene}: radiance exceeds 32-bit floats; lower the power of its lights.")
+    warnings, short = [], "RGBAN"
+    if largest > float(np.finfo(np.float16).max) and not full:
+        short = "AN"
+        warnings.append(
+            f"radiance reaches {largest:.3g}, beyond 16-bit floats (65504): R, G and B are stored in 32 bits"
+        )
+    half = [not full and name[0] in short for name in LAYERS]
     write_picture(out, picture, names=list(LAYERS), half=half)
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"Warning: {warning}.", err=True)
     return {
         "inputs": [scene, *loaded.files],
         "width": loaded.film.width,
@@ -87,4 +101,5 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         "load_seconds": round(load_seconds, 3),
         "render_seconds": round(render_seconds, 3),
         "covered": float((picture[..., 3] > 0).mean()),
+        "warnings": warnings,
     }

@@ -120,7 +120,8 @@ class Renderer:
         if self.scene.background is not None:
             picture[:, :3] += (1 - picture[:, 3:4]) * self.scene.background
             picture[:, 3] = 1
-        return picture.reshape(height, width, -1).astype(np.float32)
+        with np.errstate(over="ignore"):  # infinite, and found by who takes the picture
+            return picture.reshape(height, width, -1).astype(np.float32)
 
     def _add_environments(self, directions, missed, picture):
         """Show the visible environments where rays have hit nothing."""
