@@ -174,6 +174,8 @@ def _check_targets(targets, inputs, force):
     """Refuse outputs that are in the way of themselves, of inputs, or of what is there."""
     inputs = list(inputs)
     for i, target in enumerate(targets):
+        if target.name in ("", ".."):
+            raise click.UsageError(f"{str(target)!r} is no name of a file; give one to write.")
         refuse_inputs(target, inputs)
         if target.resolve() in {other.resolve() for other in targets[:i]}:
             raise click.UsageError(f"{target} is to be written twice; choose two names.")

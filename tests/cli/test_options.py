@@ -135,6 +135,18 @@ def test_two_outputs_of_one_name_are_refused(tmp_path):
     assert "written twice" in result.stderr
 
 
+@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("target", ["", ".", "/", "..", "a/.."])
+def test_what_names_no_file_is_wrong_usage(target, folder):
+    done = []
+    made = command(lambda out: done.append(out), folder=folder)
+    for options in (["-o", target], ["-o", target, "--force"], ["--other", target]):
+        result = run(made, *options)
+        assert result.exit_code == 2
+        assert "is no name of a file; give one to write" in result.stderr
+    assert not done
+
+
 @pytest.mark.parametrize("option", ["-o", "--other"])
 def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
     done = []
