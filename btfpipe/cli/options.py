@@ -166,7 +166,7 @@ def refuse_inputs(target, inputs):
             raise click.UsageError(f"{target} is also the input; choose another name to write.")
         if found.is_relative_to(whole):
             raise click.UsageError(
-                f"{target} holds the input {path}, which would go with what is replaced; choose another name to write."
+                f"{target} is a folder that holds the input {path}; choose another name to write."
             )
 
 

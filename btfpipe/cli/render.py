@@ -7,6 +7,10 @@ import click
 from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
 from btfpipe.errors import InputError
 
+# As in the scene's schema, which is not read for --help.
+MOST_PIXELS = 16384  # a side
+MOST_SAMPLES = 4096
+
 
 def _bindings(context, parameter, values):
     found = {}
@@ -28,9 +32,15 @@ def _bindings(context, parameter, values):
     callback=_bindings,
     help="File for the placeholder $NAME of the scene; may be given several times.",
 )
-@click.option("--width", type=click.IntRange(1), help="Pixels across, instead of the scene's.")
-@click.option("--height", type=click.IntRange(1), help="Pixels down, instead of the scene's.")
-@click.option("--samples", type=click.IntRange(1), help="Rays a pixel, instead of the scene's.")
+@click.option(
+    "--width", type=click.IntRange(1, MOST_PIXELS), help="Pixels across, instead of the scene's."
+)
+@click.option(
+    "--height", type=click.IntRange(1, MOST_PIXELS), help="Pixels down, instead of the scene's."
+)
+@click.option(
+    "--samples", type=click.IntRange(1, MOST_SAMPLES), help="Rays a pixel, instead of the scene's."
+)
 @click.option(
     "--float",
     "full",
@@ -77,7 +87,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:
-        picture = render_scene(loaded, seed=seed, threads=threads, on_progress=report)
+        picture = render_scene(loaded, seed=seed, threads=loaded.threads, on_progress=report)
     render_seconds = time.perf_counter() - start
     largest = float(np.abs(picture[..., :3]).max())
     if not np.isfinite(largest):

@@ -19,9 +19,10 @@ def tile_side(samples, slice_bytes=0):
     return min(max(int(np.sqrt(rays / samples)), 8), 256)
 
 
-def tile_bytes(samples):
+def tile_bytes(film):
     """Most bytes that a thread holds for the rays of one tile, over surfaces of one layer."""
-    return tile_side(samples) ** 2 * samples * _RAY_BYTES
+    side = tile_side(film.samples)
+    return min(side, film.width) * min(side, film.height) * film.samples * _RAY_BYTES
 
 
 def _is_sliced(thing, lights):
