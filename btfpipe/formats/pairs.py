@@ -208,19 +208,26 @@ def _source(path, listing):
 def _find(archive, wanted):
     """Lists in an archive, by their columns, and errors of what ends like one; the `wanted` one must be a list."""
     if wanted is not None and wanted not in archive.names:
-        raise InputError(f"{archive.path}: holds no {wanted}; expected a list of pictures.")
+        there = [name for name in archive.names if _may_be_list(name)]
+        raise InputError(
+            f"{archive.path}: holds no {wanted}; of .csv and .json it has {', '.join(there) or 'none'}."
+        )
     if wanted is not None:
         return [_read_table(archive, wanted)], []
     found, refused = [], []
     for name in archive.names:
-        base = PurePosixPath(name).name
-        likely = base.lower().endswith(_ENDINGS) and base != SETTINGS
-        if likely and not base.startswith(".") and "__MACOSX/" not in name:
+        if _may_be_list(name):
             try:
                 found.append(_read_table(archive, name))
             except InputError as error:
                 refused.append(error)
     return found, refused
+
+
+def _may_be_list(name):
+    base = PurePosixPath(name).name
+    likely = base.lower().endswith(_ENDINGS) and base != SETTINGS
+    return likely and not base.startswith(".") and "__MACOSX/" not in name
 
 
 def _read_table(archive, name):

@@ -68,6 +68,9 @@ def open_measurement(path, *, listing=None):
         lists = _lists(archive, wanted)
         if len(lists) != 1:
             which = " Say which with --listing." if lists else ""
+            if wanted is not None:
+                lists = _lists(archive, None)
+                which = f" {wanted} is not there."
             raise InputError(
                 f"{path}: expected one list of lights (.lp); found {', '.join(lists) or 'none'}.{which}"
             )
@@ -142,7 +145,14 @@ def _parse(archive, name):
         with np.errstate(over="ignore"):  # what is too long is refused below
             length = np.linalg.norm(light) if len(light) == 3 else np.nan
         if not 1e-6 < length < 1e6:
-            raise InputError(f"{label}, line {number}: {line[:80]!r}; expected a name and x y z.")
+            long = (
+                " of a length between 1e-6 and 1e6"
+                if np.isfinite(light).all() and len(light) == 3
+                else ""
+            )
+            raise InputError(
+                f"{label}, line {number}: {line[:80]!r}; expected a name and x y z{long}."
+            )
         if light[2] < 0:
             raise InputError(
                 f"{label}, line {number}: the light is below the surface; expected z to the camera, positive."
