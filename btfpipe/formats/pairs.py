@@ -43,6 +43,7 @@ COLUMNS = {
 LIST = "directions.csv"
 _ENDINGS = (".csv", ".json")
 _MOST_LIST = 1 << 24  # bytes
+_MOST_SPREAD_DEG = 30  # over the patch, as far as directions of measured sets lie apart
 
 # A list by its columns: member, which of COLUMNS it has, rows (where in the file, dict), settings.
 _Table = namedtuple("_Table", "member kind rows settings")
@@ -125,6 +126,14 @@ def open_measurement(path, *, listing=None, patch_cm=None):
                 )
             reference = float(np.median(np.linalg.norm(lamps, axis=1)))
             facts |= _spread(lamps, cameras, patch_cm, reference)
+            warnings = [
+                f"{name} directions differ by up to {facts[f'{name}_spread_deg']:.0f} degrees between the patch's middle and its"
+                f" corners; expected at most {_MOST_SPREAD_DEG}. Check positions and --patch-cm, both in cm."
+                for name in ("light", "view")
+                if facts[f"{name}_spread_deg"] > _MOST_SPREAD_DEG
+            ]
+            if warnings:
+                facts["warnings"] = warnings
         order, tables = _arrange(lights, views, listed.names, label)
         members = [members[i] for i in order]
 
