@@ -24,7 +24,7 @@ import numpy as np
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
-from btfpipe.formats.archive import is_zip, open_archive
+from btfpipe.formats.archive import is_hidden, is_zip, open_archive
 from btfpipe.formats.images import Decoder
 from btfpipe.formats.picture_sets import (
     SETTINGS,
@@ -234,9 +234,8 @@ def _find(archive, wanted):
 
 
 def _may_be_list(name):
-    base = PurePosixPath(name).name
-    likely = base.lower().endswith(_ENDINGS) and base != SETTINGS
-    return likely and not base.startswith(".") and "__MACOSX/" not in name
+    likely = name.lower().endswith(_ENDINGS) and PurePosixPath(name).name != SETTINGS
+    return likely and not is_hidden(name)
 
 
 def _read_table(archive, name):

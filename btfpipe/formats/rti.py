@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import open_archive
+from btfpipe.formats.archive import is_hidden, open_archive
 from btfpipe.formats.images import Decoder
 from btfpipe.formats.picture_sets import beside, measurement_of_pictures, settings_beside
 from btfpipe.formats.writing import Pictures, angles_deg, create_set
@@ -102,13 +102,7 @@ def _source(path, listing):
 def _lists(archive, wanted):
     if wanted is not None:
         return [name for name in archive.names if name == wanted]
-    return [
-        name
-        for name in archive.names
-        if name.lower().endswith(".lp")
-        and not PurePosixPath(name).name.startswith(".")
-        and "__MACOSX/" not in name
-    ]
+    return [name for name in archive.names if name.lower().endswith(".lp") and not is_hidden(name)]
 
 
 def _lines(archive, name):

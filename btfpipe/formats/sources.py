@@ -6,7 +6,7 @@ from collections import namedtuple
 from pathlib import Path, PurePosixPath
 
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import is_zip, names_in
+from btfpipe.formats.archive import is_hidden, is_zip, names_in
 from btfpipe.formats.picture_sets import SETTINGS
 from btfpipe.sample.measurement import Measurement
 
@@ -48,18 +48,17 @@ def recognise(path):
     ending = Path(path).suffix.lower()
     if ending in _ENDINGS and not Path(path).is_dir():
         return _ENDINGS[ending], f"nothing else fits, and its name ends in {ending}"
-    names = [name for name in names_in(path) or [Path(path).name] if _is_seen(name)]
+    names = [name for name in names_in(path) or [Path(path).name] if not is_hidden(name)]
     for ending, format_ in _LISTS.items():
-        lists = [name for name in names if name.lower().endswith(ending)]
+        lists = [
+            name
+            for name in names
+            if name.lower().endswith(ending) and PurePosixPath(name).name != SETTINGS
+        ]
         if lists:
             return format_, f"nothing else fits, and {lists[0]} is there"
     general = "ubo" if Path(path).is_dir() or is_zip(path) else "picture"
     return general, "no format fits"
-
-
-def _is_seen(name):
-    base = PurePosixPath(name).name
-    return not base.startswith(".") and base != SETTINGS and "__MACOSX/" not in name
 
 
 def open_source(path, name, **options):
