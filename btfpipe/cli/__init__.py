@@ -1,6 +1,9 @@
 """The command line: one module a command, imported when it is called."""
 
+import contextlib
 import importlib
+import signal
+import sys
 
 import click
 
@@ -21,8 +24,37 @@ STAGES = {
 }
 
 
+@contextlib.contextmanager
+def _signals_clean_up():
+    """Leave the block as by `sys.exit` on Ctrl-C, SIGTERM or SIGHUP, with 128 + the signal's number, as shells count.
+
+    So what is half written goes first. Further signals are ignored meanwhile: they often come in pairs, from the terminal and
+    from the program that started this one. Signals that this process was told to ignore stay ignored.
+    """
+
+    def leave(number, frame):
+        for one in before:
+            signal.signal(one, signal.SIG_IGN)
+        sys.exit(128 + number)
+
+    before = {}
+    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(one) in (signal.SIG_DFL, signal.default_int_handler):
+            with contextlib.suppress(ValueError):  # not the main thread, which alone may ask
+                before[one] = signal.signal(one, leave)
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
 class _Stages(click.Group):
     """Imports a command only when it is asked for, and lists commands in the order of the work."""
+
+    def main(self, *args, **kwargs):
+        with _signals_clean_up():
+            return super().main(*args, **kwargs)
 
     def list_commands(self, ctx):
         return list(STAGES)

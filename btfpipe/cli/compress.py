@@ -101,8 +101,11 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
         options["space"] = _SPACES[options["space"]]
     apart = options["space"] is not None or options["channel_components"] is not None
     takes = METHODS["factored" if method == "svd" and apart else method].options
-    if options["ratio"] is not None and options["target_bytes"] is not None:
-        raise click.UsageError("--ratio and --target-bytes are two ways to say the same; give one.")
+    for name in ("ratio", "clusters"):
+        if options[name] is not None and options["target_bytes"] is not None:
+            raise click.UsageError(
+                f"{flag(name)} and --target-bytes are two ways to say the same; give one."
+            )
     if options["precision"] == "byte" and method not in ("view-pca", "local-pca"):
         raise click.UsageError(f"method {method} has no --precision byte; expected half or single.")
     for name, value in options.items():

@@ -4,6 +4,7 @@ import click
 
 from btfpipe import store
 from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.errors import BtfError
 
 
 @click.command()
@@ -23,12 +24,28 @@ def info(file, threads, quiet):
         if not file.is_dir() and store.is_ours(file):
             from btfpipe.sample.describe import describe_container
 
-            facts = describe_container(store.read(file), report)
+            reader = store.read(file)
+            facts = describe_container(reader, report)
+            if reader.kind == "model" and not facts["problems"]:
+                facts["problems"] += _refusal(file)
         else:
             from btfpipe.formats.describe import describe_foreign
 
             facts = describe_foreign(file, threads, report)
     return {"inputs": [file], **facts, "text": "\n".join([f"{file}:", *_lines(facts, 1)])}
+
+
+def _refusal(model):
+    """What a Model's own reader finds wrong with its file, as a list of sentences."""
+    from btfpipe.compression import open_appearance
+
+    try:
+        open_appearance(model)
+    except BtfError as error:
+        return [str(error)]
+    except KeyError as error:
+        return [f"{model}: its description lacks {error}."]
+    return []
 
 
 def _lines(thing, depth):

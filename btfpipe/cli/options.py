@@ -1,7 +1,7 @@
 """What every command shares: options, summary, progress, exit codes.
 
 Exit codes: 0 done, 1 unforeseen (with traceback), 2 wrong usage or configuration, 3 unusable input,
-4 numerical failure.
+4 numerical failure, 128 + n if signal n ended it.
 """
 
 import contextlib
@@ -157,12 +157,26 @@ def _paths(kwargs, outputs):
                     yield one
 
 
+def refuse_inputs(target, inputs):
+    """Refuse an output that is an input too, or a folder with one; for inputs that are found late, inside of others."""
+    whole = Path(target).resolve()
+    for path in inputs:
+        found = Path(path).resolve()
+        if found == whole:
+            raise click.UsageError(f"{target} is also the input; choose another name to write.")
+        if found.is_relative_to(whole):
+            raise click.UsageError(
+                f"{target} is a folder that holds the input {path}; choose another name to write."
+            )
+
+
 def _check_targets(targets, inputs, force):
     """Refuse outputs that are in the way of themselves, of inputs, or of what is there."""
-    inputs = {path.resolve() for path in inputs}
+    inputs = list(inputs)
     for i, target in enumerate(targets):
-        if target.resolve() in inputs:
-            raise click.UsageError(f"{target} is also the input; choose another name to write.")
+        if target.name in ("", ".."):
+            raise click.UsageError(f"{str(target)!r} is no name of a file; give one to write.")
+        refuse_inputs(target, inputs)
         if target.resolve() in {other.resolve() for other in targets[:i]}:
             raise click.UsageError(f"{target} is to be written twice; choose two names.")
         if os.path.exists(target) and not force:

@@ -4,8 +4,12 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
 from btfpipe.errors import InputError
+
+# As in the scene's schema, which is not read for --help.
+MOST_PIXELS = 16384  # a side
+MOST_SAMPLES = 4096
 
 
 def _bindings(context, parameter, values):
@@ -28,14 +32,20 @@ def _bindings(context, parameter, values):
     callback=_bindings,
     help="File for the placeholder $NAME of the scene; may be given several times.",
 )
-@click.option("--width", type=click.IntRange(1), help="Pixels across, instead of the scene's.")
-@click.option("--height", type=click.IntRange(1), help="Pixels down, instead of the scene's.")
-@click.option("--samples", type=click.IntRange(1), help="Rays a pixel, instead of the scene's.")
+@click.option(
+    "--width", type=click.IntRange(1, MOST_PIXELS), help="Pixels across, instead of the scene's."
+)
+@click.option(
+    "--height", type=click.IntRange(1, MOST_PIXELS), help="Pixels down, instead of the scene's."
+)
+@click.option(
+    "--samples", type=click.IntRange(1, MOST_SAMPLES), help="Rays a pixel, instead of the scene's."
+)
 @click.option(
     "--float",
     "full",
     is_flag=True,
-    help="Store all layers as 32-bit floats; colours, alpha and normals are 16-bit otherwise.",
+    help="Store all layers as 32-bit floats; otherwise colours, alpha and normals are 16-bit, unless radiance exceeds those.",
 )
 @stage()
 def render(scene, bindings, width, height, samples, full, out, seed, threads, memory, quiet):
@@ -50,6 +60,8 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
       btfpipe render turntable.yaml --bind model=wool.model.npz --bind map=wool.map.npz -o wool.exr
     """
     import time
+
+    import numpy as np
 
     from btfpipe.formats.images import colours, open_picture, write_picture
     from btfpipe.formats.meshes import read_mesh
@@ -71,13 +83,26 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         threads=threads,
         seed=seed,
     )
+    refuse_inputs(out, loaded.files)
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:
-        picture = render_scene(loaded, seed=seed, threads=threads, on_progress=report)
+        picture = render_scene(loaded, seed=seed, threads=loaded.threads, on_progress=report)
     render_seconds = time.perf_counter() - start
-    half = [not full and name[0] in "RGBAN" for name in LAYERS]
+    largest = float(np.abs(picture[..., :3]).max())
+    if not np.isfinite(largest):
+        raise InputError(f"{scene}: radiance exceeds 32-bit floats; lower the power of its lights.")
+    warnings, short = [], "RGBAN"
+    if largest > float(np.finfo(np.float16).max) and not full:
+        short = "AN"
+        warnings.append(
+            f"radiance reaches {largest:.3g}, beyond 16-bit floats (65504): R, G and B are stored in 32 bits"
+        )
+    half = [not full and name[0] in short for name in LAYERS]
     write_picture(out, picture, names=list(LAYERS), half=half)
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"Warning: {warning}.", err=True)
     return {
         "inputs": [scene, *loaded.files],
         "width": loaded.film.width,
@@ -86,4 +111,5 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         "load_seconds": round(load_seconds, 3),
         "render_seconds": round(render_seconds, 3),
         "covered": float((picture[..., 3] > 0).mean()),
+        "warnings": warnings,
     }

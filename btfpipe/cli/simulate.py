@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import click
 
-from btfpipe.cli.options import input_file, progress, stage
+from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
 
 _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 
@@ -55,9 +55,14 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
 
     wanted = read_spec(spec)
     lights, views, index = plan(wanted, pairs)
+
+    def beside(name):
+        refuse_inputs(out, [spec.parent / name])
+        return spec.parent / name
+
     files = SimpleNamespace(
-        picture=lambda name: read_picture(spec.parent / name),
-        mesh=lambda name: read_parts(spec.parent / name),
+        picture=lambda name: read_picture(beside(name)),
+        mesh=lambda name: read_parts(beside(name)),
     )
     patch = materials.build_patch(wanted, files)
     memory -= campaign.require_memory(patch, wanted["inter_reflection"]["rays"], memory)

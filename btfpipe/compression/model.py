@@ -10,6 +10,7 @@ from btfpipe import store
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import Appearance
+from btfpipe.sample.sample import check_index
 
 _TABLES = ("light_directions", "view_directions", "light_index", "view_index")
 _BLOCK_BYTES = 4 << 20  # linear pictures compared at a time
@@ -85,10 +86,11 @@ def read_tables(reader):
     views = reader.require("view_directions", (None, 3), "f")
     if "light_index" in reader:
         index = [reader.require(name, (None,), "iu") for name in _TABLES[2:]]
-        if len(index[0]) != len(index[1]):
-            raise InputError(
-                f"{reader.path}: {len(index[0])} lights and {len(index[1])} views of pairs; expected as many."
-            )
+        try:
+            for name, table, directions in zip(_TABLES[2:], index, (lights, views), strict=True):
+                check_index(name, table, len(directions), len(index[0]))
+        except InputError as error:
+            raise InputError(f"{reader.path}: {error}") from error
     else:
         pair = np.arange(len(lights) * len(views), dtype=np.int32)
         index = [pair % len(lights), pair // len(lights)]

@@ -56,6 +56,11 @@ def open_archive(path):
     return Zip(path)
 
 
+def is_hidden(name):
+    """Whether a file in a folder or zip is none that a person put there: hidden, or of macOS's own."""
+    return PurePosixPath(name).name.startswith(".") or "__MACOSX/" in name
+
+
 def names_in(path):
     """Names of the files in a folder or zip; none for anything else, or if it cannot be read."""
     path = Path(path)

@@ -14,6 +14,7 @@ from btfpipe.formats import sources
 from btfpipe.formats.archive import is_zip, open_archive
 from btfpipe.formats.images import Decoder, is_mislabelled, open_picture
 from btfpipe.formats.meshes import ENDINGS, read_mesh
+from btfpipe.formats.picture_sets import unknown_settings
 from btfpipe.formats.ubo import Listing
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.describe import describe_directions
@@ -263,6 +264,7 @@ def _describe_set(path, threads, report):
             *_listed("pairs are there twice", [f"{a!r} and {b!r}" for a, b in listing.duplicates]),
             *_listed("pictures hold values that are not finite", not_finite),
             *_listed("pictures are mislabelled", mislabelled),
+            *unknown_settings(listing.settings),
         ]
         if len(kinds) > 1:
             sizes = [

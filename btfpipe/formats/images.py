@@ -31,6 +31,8 @@ _SIGNATURES = [
     (b"#?", ".hdr"),
     (b"II*\0", ".tif"),
     (b"MM\0*", ".tif"),
+    (b"II+\0", ".tif"),
+    (b"MM\0+", ".tif"),
     (b"BM", ".bmp"),
     (b"GIF8", ".gif"),
     (b"RIFF", ".webp"),

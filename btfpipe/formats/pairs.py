@@ -24,7 +24,7 @@ import numpy as np
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import ubo
-from btfpipe.formats.archive import is_zip, open_archive
+from btfpipe.formats.archive import is_hidden, is_zip, open_archive
 from btfpipe.formats.images import Decoder
 from btfpipe.formats.picture_sets import (
     SETTINGS,
@@ -43,6 +43,7 @@ COLUMNS = {
 LIST = "directions.csv"
 _ENDINGS = (".csv", ".json")
 _MOST_LIST = 1 << 24  # bytes
+_MOST_SPREAD_DEG = 30  # over the patch, as far as directions of measured sets lie apart
 
 # A list by its columns: member, which of COLUMNS it has, rows (where in the file, dict), settings.
 _Table = namedtuple("_Table", "member kind rows settings")
@@ -60,7 +61,7 @@ def recognise(path):
         if not (source.is_dir() or is_zip(source)):
             return None
         with open_archive(source) as archive:
-            found = _find(archive, wanted)
+            found, _ = _find(archive, wanted)
     except (InputError, OSError):
         return None
     if not found:
@@ -97,13 +98,13 @@ def open_measurement(path, *, listing=None, patch_cm=None):
     """
     source, wanted = _source(path, listing)
     with open_archive(source) as archive, Decoder() as decoder:
-        found = _find(archive, wanted)
+        found, refused = _find(archive, wanted)
         if len(found) != 1:
             several = ", ".join(f.member for f in found) or "none"
-            which = " Say which with --listing." if found else ""
+            more = " Say which with --listing." if found else " ".join(["", *map(str, refused[:1])])
             raise InputError(
                 f"{path}: expected one .csv or .json that lists names of pictures and their directions; found"
-                f" {several}.{which}"
+                f" {several}.{more}"
             )
         label = archive.label(found[0].member)
         listed = _read_list(found[0], label)
@@ -125,6 +126,14 @@ def open_measurement(path, *, listing=None, patch_cm=None):
                 )
             reference = float(np.median(np.linalg.norm(lamps, axis=1)))
             facts |= _spread(lamps, cameras, patch_cm, reference)
+            warnings = [
+                f"{name} directions differ by up to {facts[f'{name}_spread_deg']:.0f} degrees between the patch's middle and its"
+                f" corners; expected at most {_MOST_SPREAD_DEG}. Check positions and --patch-cm, both in cm."
+                for name in ("light", "view")
+                if facts[f"{name}_spread_deg"] > _MOST_SPREAD_DEG
+            ]
+            if warnings:
+                facts["warnings"] = warnings
         order, tables = _arrange(lights, views, listed.names, label)
         members = [members[i] for i in order]
 
@@ -206,19 +215,27 @@ def _source(path, listing):
 
 
 def _find(archive, wanted):
-    """Lists in an archive, by their columns; the `wanted` one must be a list."""
+    """Lists in an archive, by their columns, and errors of what ends like one; the `wanted` one must be a list."""
     if wanted is not None and wanted not in archive.names:
-        raise InputError(f"{archive.path}: holds no {wanted}; expected a list of pictures.")
+        there = [name for name in archive.names if _may_be_list(name)]
+        raise InputError(
+            f"{archive.path}: holds no {wanted}; of .csv and .json it has {', '.join(there) or 'none'}."
+        )
     if wanted is not None:
-        return [_read_table(archive, wanted)]
-    found = []
+        return [_read_table(archive, wanted)], []
+    found, refused = [], []
     for name in archive.names:
-        base = PurePosixPath(name).name
-        likely = base.lower().endswith(_ENDINGS) and base != SETTINGS
-        if likely and not base.startswith(".") and "__MACOSX/" not in name:
-            with contextlib.suppress(InputError):
+        if _may_be_list(name):
+            try:
                 found.append(_read_table(archive, name))
-    return found
+            except InputError as error:
+                refused.append(error)
+    return found, refused
+
+
+def _may_be_list(name):
+    likely = name.lower().endswith(_ENDINGS) and PurePosixPath(name).name != SETTINGS
+    return likely and not is_hidden(name)
 
 
 def _read_table(archive, name):
@@ -228,13 +245,16 @@ def _read_table(archive, name):
     try:
         read = _json if name.lower().endswith(".json") else _csv
         header, rows, settings = read(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{label}: not a list of pictures: its text is not UTF-8.") from error
     except (ValueError, csv.Error, RecursionError) as error:
         raise InputError(f"{label}: not a list of pictures ({error}).") from error
     kind = next((k for k, c in COLUMNS.items() if {"name", *c} <= header), None)
     if kind is None:
         columns = "; ".join(", ".join(c) for c in COLUMNS.values())
+        seen = _shown(", ".join(sorted(header - {""}))) if header - {""} else "none"
         raise InputError(
-            f"{label}: not a list of pictures; expected the columns name and one of: {columns}."
+            f"{label}: not a list of pictures; expected the columns name and one of: {columns}. Found {seen}."
         )
     return _Table(name, kind, rows, settings)
 
@@ -277,7 +297,7 @@ def _csv(text):
     lines = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)
     header = [cell.strip().lower() for cell in next(lines, [])]
     if len(set(header)) != len(header):
-        raise ValueError("a column comes twice")
+        raise ValueError(f"line 1 is {_shown(head)}, where a column comes twice; expected a header")
     rows = []
     for cells in lines:
         if any(cells):

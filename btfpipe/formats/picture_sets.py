@@ -9,6 +9,10 @@ from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
 
 SETTINGS = "btfpipe.json"
+# What settings may be called; `title` and `layout` are for readers of the file alone, the last two for one format each.
+_KNOWN = (
+    "white", "transfer", "toroidal", "texels_per_mm", "title", "layout", "colour", "patch_cm",
+)  # fmt: skip
 _MOST_SETTINGS = 1 << 20  # bytes
 
 
@@ -27,7 +31,7 @@ def measurement_of_pictures(
     settings : dict
         As in ``btfpipe.json``, checked; what they do not say stays open.
     facts : dict
-        For the summary; gets ``mislabelled``, the set of members that were.
+        For the summary; gets ``mislabelled``, the set of members that were, and perhaps ``warnings``.
     curve : str
         Transfer curve of pictures with integers, where settings name no other; floats are linear.
     rgb : function
@@ -37,6 +41,9 @@ def measurement_of_pictures(
     """
     labels = [archive.label(name) for name in members]
     facts["mislabelled"] = set()
+    unknown = unknown_settings(settings)
+    if unknown:
+        facts["warnings"] = [*facts.get("warnings", []), *unknown]
 
     def read(pair):
         picture = decoder.decode(archive.read(members[pair]), labels[pair])
@@ -81,6 +88,14 @@ def settings_beside(archive, member):
     """Settings beside a list of pictures; none if there is no such file."""
     name = beside(member)
     return read_settings(archive, name) if name in archive.names else {}
+
+
+def unknown_settings(settings):
+    """Warnings, as a list of sentences, of settings that nothing reads, which may be misspelt."""
+    unknown = [repr(key) for key in settings if key not in _KNOWN]
+    if not unknown:
+        return []
+    return [f"unknown settings {', '.join(unknown)} in {SETTINGS}; expected {', '.join(_KNOWN)}."]
 
 
 def check_settings(settings, label):

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import open_archive
+from btfpipe.formats.archive import is_hidden, open_archive
 from btfpipe.formats.images import Decoder
 from btfpipe.formats.picture_sets import beside, measurement_of_pictures, settings_beside
 from btfpipe.formats.writing import Pictures, angles_deg, create_set
@@ -68,6 +68,9 @@ def open_measurement(path, *, listing=None):
         lists = _lists(archive, wanted)
         if len(lists) != 1:
             which = " Say which with --listing." if lists else ""
+            if wanted is not None:
+                lists = _lists(archive, None)
+                which = f" {wanted} is not there."
             raise InputError(
                 f"{path}: expected one list of lights (.lp); found {', '.join(lists) or 'none'}.{which}"
             )
@@ -99,13 +102,7 @@ def _source(path, listing):
 def _lists(archive, wanted):
     if wanted is not None:
         return [name for name in archive.names if name == wanted]
-    return [
-        name
-        for name in archive.names
-        if name.lower().endswith(".lp")
-        and not PurePosixPath(name).name.startswith(".")
-        and "__MACOSX/" not in name
-    ]
+    return [name for name in archive.names if name.lower().endswith(".lp") and not is_hidden(name)]
 
 
 def _lines(archive, name):
@@ -142,7 +139,14 @@ def _parse(archive, name):
         with np.errstate(over="ignore"):  # what is too long is refused below
             length = np.linalg.norm(light) if len(light) == 3 else np.nan
         if not 1e-6 < length < 1e6:
-            raise InputError(f"{label}, line {number}: {line[:80]!r}; expected a name and x y z.")
+            long = (
+                " of a length between 1e-6 and 1e6"
+                if np.isfinite(light).all() and len(light) == 3
+                else ""
+            )
+            raise InputError(
+                f"{label}, line {number}: {line[:80]!r}; expected a name and x y z{long}."
+            )
         if light[2] < 0:
             raise InputError(
                 f"{label}, line {number}: the light is below the surface; expected z to the camera, positive."

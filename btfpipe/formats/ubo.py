@@ -14,7 +14,7 @@ import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
-from btfpipe.formats.archive import COPY, names_in, open_archive
+from btfpipe.formats.archive import COPY, is_hidden, names_in, open_archive
 from btfpipe.formats.images import Decoder
 from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures, read_settings
 
@@ -66,11 +66,10 @@ class Listing:
         pairs, self.duplicates, self.strays, self.settings = {}, [], [], {}
         for name in archive.names:
             base = COPY.sub("", PurePosixPath(name).name)
-            hidden = base.startswith(".") or "__MACOSX/" in name
             angles = parse_name(base)
             if base == SETTINGS:
                 self.settings = read_settings(archive, name)
-            elif angles is None or hidden or not base.lower().endswith(_ENDINGS):
+            elif angles is None or is_hidden(name) or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)
             else:
                 light, view = (direction(a, archive.label(name)) for a in angles)

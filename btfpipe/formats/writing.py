@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -68,27 +67,16 @@ def create_set(path, settings):
         raise InputError(
             f"{path}: is there and was not written by btfpipe (no {SETTINGS} in it); choose another --out."
         )
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        try:
-            part.mkdir()
+    with store.whole_folder(path) as part:
 
-            def put(name, data):
-                once(name)
-                target = part / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(data)
+        def put(name, data):
+            once(name)
+            target = part / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(data)
 
-            put(SETTINGS, about)
-            yield put
-            if path.exists():
-                shutil.rmtree(path)
-            part.replace(path)
-        except OSError as error:
-            raise InputError(store._cannot_write(path, error)) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        put(SETTINGS, about)
+        yield put
 
 
 class Pictures:

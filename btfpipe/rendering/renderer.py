@@ -19,9 +19,10 @@ def tile_side(samples, slice_bytes=0):
     return min(max(int(np.sqrt(rays / samples)), 8), 256)
 
 
-def tile_bytes(samples):
+def tile_bytes(film):
     """Most bytes that a thread holds for the rays of one tile, over surfaces of one layer."""
-    return tile_side(samples) ** 2 * samples * _RAY_BYTES
+    side = tile_side(film.samples)
+    return min(side, film.width) * min(side, film.height) * film.samples * _RAY_BYTES
 
 
 def _is_sliced(thing, lights):
@@ -120,7 +121,8 @@ class Renderer:
         if self.scene.background is not None:
             picture[:, :3] += (1 - picture[:, 3:4]) * self.scene.background
             picture[:, 3] = 1
-        return picture.reshape(height, width, -1).astype(np.float32)
+        with np.errstate(over="ignore"):  # infinite, and found by who takes the picture
+            return picture.reshape(height, width, -1).astype(np.float32)
 
     def _add_environments(self, directions, missed, picture):
         """Show the visible environments where rays have hit nothing."""

@@ -57,6 +57,8 @@ class Scene:
         What the scene was loaded from, without the description itself.
     environments : list of Environment
         Those that are visible are seen where nothing is hit.
+    threads : int
+        That may render it within the memory.
     """
 
     camera: Camera
@@ -66,6 +68,7 @@ class Scene:
     background: np.ndarray | None = None
     files: list | None = None
     environments: list = field(default_factory=list)
+    threads: int = 1
 
 
 def load_scene(
@@ -97,7 +100,7 @@ def load_scene(
         Bytes that an environment map in work may take, and those that the copies of Samples to shade from and the tiles in work
         may.
     threads : int
-        That will render; each works on a tile.
+        That will render, unless the memory is for fewer; each works on a tile.
     seed : int
         Of environment maps sampled at random.
 
@@ -108,15 +111,22 @@ def load_scene(
     Raises
     ------
     InputError
-        As `read_description`; if files do not belong together; if Samples or a map take more than `memory`; if the camera is
-        inside an object.
+        As `read_description`; if files do not belong together; if a tile, Samples or a map take more than `memory`; if the
+        camera is inside an object.
     """
     description = read_description(path, bindings)
     settings = description.get("film", {}) | {k: v for k, v in (film or {}).items() if v}
     settings.setdefault("filter", "gaussian")
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
+    tile = tile_bytes(film)
     try:
+        if memory is not None and tile > memory:
+            raise InputError(
+                f"the rays of a tile of pixels take {_size(tile)}; --memory allows {_size(memory)}. Pass --memory"
+                f" {math.ceil(tile / 2**20)}M."
+            )
+        threads = threads if memory is None else min(threads, memory // tile)
         lights, environments, skies = [], [], {}
         opened, things, grounds, files = {}, [], [], []
         for number, light in enumerate(description["lights"]):
@@ -137,7 +147,7 @@ def load_scene(
                     )
             else:
                 lights.append(_light(number, light))
-        room = None if memory is None else (memory, threads * tile_bytes(film.samples))
+        room = None if memory is None else (memory, threads * tile)
         for number, entry in enumerate(description["objects"]):
             files += [entry[key] for key in ("surface", "map", "model", "mesh") if key in entry]
             if "ground" in entry:
@@ -172,7 +182,7 @@ def load_scene(
     return Scene(
         camera, film, lights, things,
         None if background is None else np.array(background, float),
-        list(dict.fromkeys(files)), environments,
+        list(dict.fromkeys(files)), environments, threads,
     )  # fmt: skip
 
 

@@ -8,6 +8,15 @@ from btfpipe.sample.appearance import Appearance
 from btfpipe.sample.transfer import TRANSFERS, decode, decode_table
 
 
+def check_index(name, index, count, pairs):
+    """Refuse a table of `pairs` indices into `count` directions that has another length or leaves them."""
+    low, high = (index.min(), index.max()) if len(index) else (0, -1)
+    if len(index) != pairs or not 0 <= low <= high < count:
+        raise InputError(
+            f"{name} runs from {low} to {high} over {len(index)} pairs; expected 0 to {count - 1} over {pairs}."
+        )
+
+
 class Sample(Appearance):
     """A measured or simulated BTF, in one layout: ``(pair, row, col, channel)`` and two index tables.
 
@@ -70,11 +79,7 @@ class Sample(Appearance):
             ("light_index", self.light_index, len(self.light_directions)),
             ("view_index", self.view_index, len(self.view_directions)),
         ):
-            if len(index) != len(codes) or index.min() < 0 or index.max() >= count:
-                raise InputError(
-                    f"{name} runs from {index.min()} to {index.max()} over {len(index)} pairs; expected"
-                    f" 0 to {count - 1} over {len(codes)}."
-                )
+            check_index(name, index, count, len(codes))
         self.transfer = transfer
         self.scale = float(scale)
         self.gain = gain

@@ -129,6 +129,11 @@ def test_what_is_no_sample_is_refused_and_nothing_is_written(btfpipe, make_sampl
         ((*SVD, "--memory", "10K"), 3, "s.sample.npz: 50 vectors"),
         (("--method", "view-pca", "--clusters", 3), 2, "view-pca has no --clusters"),
         (("--ratio", 50, "--target-bytes", "9K"), 2, "two ways to say the same"),
+        (
+            ("--method", "local-pca", "--clusters", 3, "--target-bytes", "9K"),
+            2,
+            "two ways to say the same",
+        ),
         (("--method", "harmonics", "--view-harmonics", 7), 3, "square number"),
         (("--memory", "9" * 400), 2, "more memory than any machine has"),
     ],

@@ -59,6 +59,15 @@ def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
     )
 
 
+def test_a_folder_of_others_is_left_alone_when_a_set_is_written(btfpipe, small, tmp_path):
+    (tmp_path / "set.part").mkdir()
+    (tmp_path / "set.part/mine.txt").write_text("mine")
+    for options in ([], ["--force"]):
+        btfpipe("export", small, "-o", tmp_path / "set", *options)
+        assert (tmp_path / "set.part/mine.txt").read_text() == "mine"
+        assert {p.name for p in tmp_path.iterdir()} == {"s.npz", "set", "set.part"}
+
+
 def test_an_option_of_another_format_is_refused(btfpipe, small, tmp_path):
     done = btfpipe(
         "export", small, "--format", "pairs", "--sample-number", 3, "-o", tmp_path / "x.zip", code=2

@@ -296,3 +296,28 @@ def test_a_damaged_set_is_described_by_what_is_wrong(btfpipe, make_sample, tmp_p
     facts = json.loads(btfpipe("info", tmp_path / "cut.btf", "--json").stdout)
     assert len(facts["problems"]) == 1
     assert "cut.btf" in facts["problems"][0]
+
+
+@pytest.mark.parametrize("method", ["coded", "local-pca", "svd"])
+@pytest.mark.parametrize("table", ["light_index", "view_index"])
+def test_a_model_with_a_wrong_index_is_refused_like_a_sample(
+    btfpipe, make_sample, tmp_path, method, table
+):
+    from btfpipe.compression import compress as make_model
+
+    sample = make_sample(8, 8)
+    some = Sample(
+        sample.codes[:100], sample.light_directions, sample.view_directions,
+        sample.light_index[:100], sample.view_index[:100],
+    )  # fmt: skip
+    path = tmp_path / "m.npz"
+    make_model([some], method).save(path)
+    assert "problems: none" in btfpipe("info", path).stdout
+    reader = store.read(path)
+    arrays = {name: np.array(reader[name]) for name in reader.names()}
+    arrays[table][3] = 9999
+    about = {k: v for k, v in reader.about.items() if k not in ("kind", "format", "btfpipe")}
+    store.write(path, "model", arrays, **about)
+    message = f"m.npz: {table} runs from 0 to 9999 over 100 pairs"
+    assert message in btfpipe("info", path).stdout
+    assert message in btfpipe("preview", path, "-o", tmp_path / "p.png", code=3).stderr

@@ -180,8 +180,7 @@ def test_a_full_disk_is_one_clear_sentence(make_measurement, tmp_path):
     assert done.returncode == 3, done.stderr
     assert "s.npz: cannot be written (File too large)" in done.stderr
     assert "Traceback" not in done.stderr
-    assert not (tmp_path / "s.npz").exists()
-    assert not (tmp_path / "s.npz.part").exists()
+    assert not list(tmp_path.glob("s.npz*"))
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a place where nobody may write")
@@ -196,13 +195,17 @@ def test_an_output_that_is_a_folder_is_one_clear_sentence(btfpipe, make_measurem
     (tmp_path / "s.npz").mkdir()
     result = btfpipe("ingest", path, "-o", tmp_path / "s.npz", "--force", code=3)
     assert "cannot be written (Is a directory)" in result.stderr
-    assert not (tmp_path / "s.npz.part").exists()
+    assert [p.name for p in tmp_path.glob("s.npz*")] == ["s.npz"]
 
 
 def test_killed_half_way_the_next_run_ends_with_the_same_bytes(make_measurement, tmp_path):
     lights = [(0, 0)] + [(theta, phi) for theta in (30, 60) for phi in range(0, 360, 6)]
     path, _ = make_measurement(lights=lights, shape=(128, 128), suffix=".jpg")
-    out, part = tmp_path / "s.npz", tmp_path / "s.npz.part"
+    out = tmp_path / "s.npz"
+
+    def parts():
+        return [part for part in tmp_path.glob("s.npz.*") if part.stat().st_size > 2**18]
+
     subprocess.run(run("ingest", path, "-o", tmp_path / "whole.npz", "-q"), check=True)
 
     # the victim holds still after its first block, so that the kill is certain to come half-way
@@ -215,18 +218,38 @@ def test_killed_half_way_the_next_run_ends_with_the_same_bytes(make_measurement,
     process = subprocess.Popen([sys.executable, "-c", victim, "ingest", path, "-o", out, "-q"])
     try:
         deadline = time.monotonic() + 60
-        while not (part.exists() and part.stat().st_size > 2**18):
+        while not parts():
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.01)
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    assert part.exists()
+    assert parts()
     assert not out.exists()
     subprocess.run(run("ingest", path, "-o", out, "-q"), check=True)
-    assert not part.exists()
+    assert not list(tmp_path.glob("s.npz.*"))
     assert out.read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_a_misspelt_setting_is_told_by_name(btfpipe, make_measurement, make_sample, tmp_path):
+    def change(members):
+        members["btfpipe.json"] = json.dumps({"wite": 1, "toroidal": True, "title": "cloth"})
+
+    bonn, _ = make_measurement(change=change)
+    make_sample(6, 8).save(tmp_path / "s.npz")
+    sets = [bonn]
+    for format_ in ("ubo", "utia", "rti", "pairs"):
+        sets.append(tmp_path / format_)
+        btfpipe("export", tmp_path / "s.npz", "--format", format_, "-o", sets[-1])
+        done = btfpipe("ingest", sets[-1], "-o", tmp_path / "t.npz", "--force")
+        assert "unknown" not in done.stderr  # what btfpipe writes itself it knows
+        settings = json.loads((sets[-1] / "btfpipe.json").read_text())
+        (sets[-1] / "btfpipe.json").write_text(json.dumps(settings | {"wite": 1}))
+    for path in sets:
+        done = btfpipe("ingest", path, "-o", tmp_path / "t.npz", "--force")
+        assert "Warning: unknown settings 'wite' in btfpipe.json; expected white" in done.stderr
+        assert "unknown settings 'wite' in" in btfpipe("info", path).stdout
 
 
 def test_a_model_is_no_sample(tmp_path):

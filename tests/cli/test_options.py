@@ -109,6 +109,17 @@ def test_an_input_is_never_an_output_even_with_force(tmp_path):
     assert (tmp_path / "a").read_text() == "mine"
 
 
+def test_a_folder_with_the_input_is_never_an_output(tmp_path):
+    (tmp_path / "set/below").mkdir(parents=True)
+    (tmp_path / "set/below/a").write_text("mine")
+    done = []
+    made = command(lambda out: done.append(out), folder=True)
+    result = run(made, tmp_path / "set/below/a", "-o", tmp_path / "set", "--force")
+    assert result.exit_code == 2
+    assert "holds the input" in result.stderr
+    assert not done
+
+
 def test_a_sample_does_not_replace_itself_by_its_model(btfpipe, make_sample, tmp_path):
     path = tmp_path / "s.npz"
     make_sample().save(path)
@@ -122,6 +133,18 @@ def test_two_outputs_of_one_name_are_refused(tmp_path):
     result = run(command(lambda out: None), "-o", tmp_path / "a", "--other", tmp_path / "a")
     assert result.exit_code == 2
     assert "written twice" in result.stderr
+
+
+@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("target", ["", ".", "/", "..", "a/.."])
+def test_what_names_no_file_is_wrong_usage(target, folder):
+    done = []
+    made = command(lambda out: done.append(out), folder=folder)
+    for options in (["-o", target], ["-o", target, "--force"], ["--other", target]):
+        result = run(made, *options)
+        assert result.exit_code == 2
+        assert "is no name of a file; give one to write" in result.stderr
+    assert not done
 
 
 @pytest.mark.parametrize("option", ["-o", "--other"])
@@ -144,10 +167,8 @@ def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
 
 def test_a_command_that_writes_folders_may_replace_one(tmp_path):
     (tmp_path / "set").mkdir()
-    (tmp_path / "set.part").mkdir()
     made = command(lambda out: None, folder=True)
     assert run(made, "-o", tmp_path / "set", "--force").exit_code == 0
-    assert (tmp_path / "set.part").is_dir()
 
 
 @pytest.mark.parametrize("kind", [InputError, NumericalError])

@@ -169,6 +169,19 @@ def test_eight_bit_pictures_are_linear_before_they_are_corrected(tmp_path):
     assert facts["source_transfer"] == "srgb"
 
 
+@pytest.mark.parametrize(
+    ("lamp", "camera", "told"),
+    [((0, 0, 30), (0, 0, 50), []), ((1, 0, 0.01), (0, 0, 50), ["light"]), ((0, 0, 30), (0, 0, 9), ["view"])],
+)  # fmt: skip
+def test_a_lamp_or_camera_too_near_for_one_direction_is_told(tmp_path, lamp, camera, told):
+    row = ",".join(map(str, ("a.png", *lamp, *camera)))
+    folder = put(tmp_path / "set", POSITIONS + row + "\n", {"a": np.full((4, 4, 3), 9, np.uint8)})
+    _, facts = read_back(folder, tmp_path / "s.npz", patch_cm=(12.0, 12.0))
+    warnings = facts.get("warnings", [])
+    assert [warning.partition(" ")[0] for warning in warnings] == told
+    assert all("degrees between the patch's middle and its corners" in w for w in warnings)
+
+
 HEAD = "name,theta_l,phi_l,theta_v,phi_v\n"
 POSITIONS = "name," + ",".join(pairs.COLUMNS["positions"]) + "\n"
 

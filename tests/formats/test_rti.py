@@ -73,7 +73,7 @@ def test_the_frontal_view_comes_back(tmp_path, make_sample, target, suffix, tole
         ("1\nfirst light.png 0 0\n", "line 2.*expected a name and x y z"),
         ("1\n0 0 1\n", "line 2.*expected a name and x y z"),
         ("1\nfirst light.png 0 0 nan\n", "line 2.*expected a name and x y z"),
-        ("1\nfirst light.png 0 0 0\n", "line 2.*expected a name and x y z"),
+        ("1\nfirst light.png 0 0 0\n", "line 2.*expected a name and x y z of a length between"),
         ("1\nfirst light.png 0 0 1e300\n", "line 2.*expected a name and x y z"),
         ("1\nfirst light.png 0 1 -0.1\n", "below the surface"),
         ("2\nfirst light.png 0 0 1\nin/b.PNG 0 0 2\n", "the same light"),
@@ -110,9 +110,10 @@ def test_a_folder_without_a_list_or_with_two_is_refused(tmp_path, lp):
     assert sources.recognise(folder) == ("rti", "2 lists of lights: list.lp, other.lp")
     with rti.open_measurement(folder, listing="other.lp") as measurement:
         assert measurement.n_pairs == 1
-    with pytest.raises(InputError, match="found none"):
-        with rti.open_measurement(folder / "third.lp"):
-            pass
+    for path, listing in ((folder / "third.lp", None), (folder, "third.lp")):
+        with pytest.raises(InputError, match=r"found list\.lp, other\.lp\. third\.lp is not there"):
+            with rti.open_measurement(path, listing=listing):
+                pass
 
 
 def test_a_cut_picture_and_an_unsafe_zip_are_refused_by_name(tmp_path, lp):

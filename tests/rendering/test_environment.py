@@ -510,6 +510,44 @@ def test_unusable_map_is_refused_by_key(values, light, message, scene_file, btfp
     assert not (tmp_path / "p.exr").exists()
 
 
+def test_picture_never_replaces_its_own_environment(scene_file, btfpipe, tmp_path):
+    write_picture(tmp_path / "room.exr", _with(1))
+    before = (tmp_path / "room.exr").read_bytes()
+    path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.exr"}])
+    done = btfpipe("render", path, "-o", tmp_path / "room.exr", "--force", code=2)
+    assert "room.exr is also the input" in done.stderr
+    assert (tmp_path / "room.exr").read_bytes() == before
+
+
+@pytest.mark.parametrize(("radiance", "warned"), [(6e4, False), (1e6, True), (1e30, True)])
+def test_radiance_beyond_half_precision_is_kept_and_told(
+    scene_file, btfpipe, tmp_path, radiance, warned
+):
+    import json
+
+    from btfpipe.formats.images import open_picture
+
+    write_picture(tmp_path / "room.exr", np.full((4, 8, 3), radiance, np.float32))
+    path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.exr"}])
+    out = tmp_path / "p.exr"
+    for options in ((), ("--float",), ("--json",)):
+        done = btfpipe("render", path, "-o", out, "--force", *options)
+        told = "beyond 16-bit floats (65504): R, G and B are stored in 32 bits" in done.stderr
+        assert told == (warned and options != ("--float",))
+        picture = open_picture(out)
+        seen = picture.values[0, 0, [picture.channels.index(c) for c in "RGB"]]  # beside the object
+        np.testing.assert_allclose(seen, radiance, rtol=1e-3)
+    assert bool(json.loads(done.stdout)["warnings"]) == warned
+
+
+def test_radiance_beyond_single_precision_is_refused(scene_file, btfpipe, tmp_path):
+    lamp = {"type": "directional", "direction": [0, 0, 1], "irradiance": [1e40, 0, 0]}
+    path = scene_file([WHITE], lights=[lamp])
+    done = btfpipe("render", path, "-o", tmp_path / "p.exr", code=3)
+    assert "scene.yaml: radiance exceeds 32-bit floats" in done.stderr
+    assert not (tmp_path / "p.exr").exists()
+
+
 def test_picture_of_codes_is_no_environment(scene_file, btfpipe, tmp_path):
     write_picture(tmp_path / "room.png", np.zeros((4, 8, 3), np.uint8))
     path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.png"}])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from btfpipe.description import read_description
 from btfpipe.errors import InputError
@@ -214,7 +215,7 @@ def test_sample_whose_copy_exceeds_the_memory_is_refused_and_its_model_is_not(
     compress_svd(sample, 4).save(tmp_path / "m.model.npz")
     path = scene_file([{"plane": PLANE, "model": "$model"}])
     command = ["render", path, "-o", tmp_path / "p.exr", "--force", "--threads", 1]
-    tiles = 256 * 256 * 600 / 2**20  # 37.5 MiB
+    tiles = 64 * 64 * 600 / 2**20  # 2.3 MiB: all pixels
     for memory, model, code in (
         (tiles + 6, "m.sample.npz", 3),
         (tiles + 7, "m.sample.npz", 0),
@@ -224,8 +225,40 @@ def test_sample_whose_copy_exceeds_the_memory_is_refused_and_its_model_is_not(
             *command, "--memory", f"{memory}M", "--bind", f"model={tmp_path / model}", code=code
         )
         if code:
-            assert "makes 44 MiB of the 44 MiB that --memory allows" in done.stderr
+            assert "makes 9 MiB of the 8 MiB that --memory allows" in done.stderr
             assert "`btfpipe compress`" in done.stderr
+
+
+def test_memory_that_holds_no_tile_is_refused_and_that_for_few_means_fewer_threads(
+    scene_file, btfpipe, tmp_path
+):
+    path = scene_file([GREY], film={"width": 600, "height": 600, "samples": 1})
+    out = tmp_path / "p.exr"
+    done = btfpipe("render", path, "-o", out, "--memory", "37M", code=3)  # 256 x 256 x 600 bytes
+    assert (
+        "scene.yaml: the rays of a tile of pixels take 38 MiB; --memory allows 37 MiB"
+        in done.stderr
+    )
+    assert "Pass --memory 38M." in done.stderr
+    assert load_scene(path, memory=3 * 256 * 256 * 600, threads=5).threads == 3
+    assert load_scene(path, memory=2**40, threads=5).threads == 5
+    btfpipe("render", path, "-o", out, "--memory", "38M", "--threads", 2)
+
+
+@pytest.mark.parametrize("name", ["width", "height", "samples"])
+def test_film_may_be_what_its_schema_allows_on_the_command_line_too(
+    scene_file, btfpipe, tmp_path, name
+):
+    from importlib import import_module, resources
+
+    schema = resources.files("btfpipe.rendering").joinpath("scene.schema.yaml").read_text("utf-8")
+    allowed = yaml.safe_load(schema)["properties"]["film"]["properties"][name]
+    option = next(o for o in import_module("btfpipe.cli.render").render.params if o.name == name)
+    assert (option.type.min, option.type.max) == (allowed["minimum"], allowed["maximum"])
+    path = scene_file([GREY])
+    wrong = allowed["maximum"] + 1
+    done = btfpipe("render", path, "-o", tmp_path / "p.exr", f"--{name}", wrong, code=2)
+    assert f"{wrong} is not in the range" in done.stderr
 
 
 def test_binding_that_no_placeholder_asks_for_is_refused(scene_file):

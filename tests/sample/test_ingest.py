@@ -253,8 +253,7 @@ def test_a_picture_with_values_that_are_not_finite_is_named(
     path, _ = make_measurement(suffix=".exr", dtype=np.float32, change=change)
     with pytest.raises(InputError, match=r"tl030 pl090 tv045.*holds 1 NaN or infinite"):
         ingest(path)
-    assert not (tmp_path / "s.sample.npz").exists()
-    assert not (tmp_path / "s.sample.npz.part").exists()
+    assert not list(tmp_path.glob("s.sample.npz*"))
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 7, 3), (-1, 0, 2, 2), (0, 0, 0, 3), (5, 7, 1, 2)])
