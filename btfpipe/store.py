@@ -14,9 +14,11 @@ import hashlib
 import io
 import json
 import math
+import mmap
 import os
 import stat
 import struct
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -134,6 +136,51 @@ def _plain(thing):
     raise TypeError(f"{type(thing).__name__} has no JSON form")
 
 
+def scratch(shape, dtype):
+    """An array of zeros, mapped from a temporary file without a name that goes when the array does.
+
+    For results too large to be kept in memory until they are written. The folder is that of `tempfile`: the
+    environment variable TMPDIR chooses it.
+
+    Raises
+    ------
+    InputError
+        If the folder has no room for it.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with tempfile.TemporaryFile() as file:
+        try:
+            # a mapped file that runs out of room ends the program, without a word
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for a temporary file of {math.ceil(size / (1 << 20))} MB"
+                f" ({error.strerror}); make room there, choose another folder by TMPDIR, or raise --memory."
+            ) from error
+        return np.memmap(file, dtype, "r+", shape=tuple(shape))
+
+
+def will_read(array, part):
+    """Ask the system for ``array[:, part]`` of a mapped array, and for nothing around it.
+
+    Left to itself it reads on behind every place that is touched: for a few scan lines of all pictures nearly the whole file,
+    and again for the next few if the file is larger than memory. Of an array in memory nothing is asked.
+    """
+    mapped = array.base
+    if isinstance(mapped, mmap.mmap) and hasattr(mapped, "madvise"):
+        for start, length in _pages(array, part):
+            mapped.madvise(mmap.MADV_WILLNEED, start, length)
+
+
+def _pages(array, part):
+    """Start and length, in bytes of the mapped file, of ``array[i, part]`` for each i, from whole pages on."""
+    size, line = array.strides[:2]
+    first = array.offset % mmap.ALLOCATIONGRANULARITY + part.start * line
+    for start in range(first, first + len(array) * size, size):
+        page = start // mmap.PAGESIZE * mmap.PAGESIZE
+        yield page, start + (part.stop - part.start) * line - page
+
+
 class Writer:
     """Writes the members of a container one after the other, streaming.
 
@@ -147,9 +194,11 @@ class Writer:
 
     def array(self, name, array):
         """Write one array as member `name`."""
-        array = np.ascontiguousarray(array)
+        array = np.asarray(array)
         with self.stream(name, array.shape, array.dtype) as put:
-            put(array)
+            # what lies in another order is copied part by part
+            for part in [array] if array.flags.c_contiguous else array:
+                put(part)
 
     @contextlib.contextmanager
     def stream(self, name, shape, dtype):

@@ -1,6 +1,8 @@
 import io
 import json
+import mmap
 import struct
+import tempfile
 import zipfile
 
 import numpy as np
@@ -109,6 +111,44 @@ def test_streaming_equals_writing_at_once(path, tmp_path):
         for name in ("half", "empty", "scalar"):
             writer.array(name, ARRAYS[name])
     assert path.read_bytes() == (tmp_path / "s.npz").read_bytes()
+
+
+def test_arrays_in_any_order_of_memory_are_written_alike(path, tmp_path, rng):
+    wide = rng.random((5, 8, 6))
+    arrays = {
+        "part": wide[:, :3],
+        "turned": wide.T,
+        "line": wide[0, 0],
+        "every other": wide[::2, 0, 1],
+    }
+    store.write(path, "sample", arrays)
+    store.write(tmp_path / "b.npz", "sample", {k: a.copy(order="C") for k, a in arrays.items()})
+    assert path.read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_scratch_array_is_zero_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    array = store.scratch((3, 4), np.int16)
+    assert list(tmp_path.iterdir()) == []
+    assert not array.any()
+    array[1] = 7
+    assert array.sum() == 28
+
+
+def test_the_bytes_asked_for_are_those_of_the_part(path, rng):
+    array = rng.integers(0, 255, (7, 40, 50, 3)).astype(np.uint8)
+    store.write(path, "sample", {"before": np.zeros(5001, np.uint8), "pictures": array})
+    mapped = store.read(path)["pictures"]
+    for part in (slice(0, 3), slice(11, 12), slice(38, 40), slice(0, 40)):
+        store.will_read(mapped, part)
+        store.will_read(array, part)
+        ranges = list(store._pages(mapped, part))
+        assert len(ranges) == 7
+        for (start, length), picture in zip(ranges, array, strict=True):
+            assert start % mmap.PAGESIZE == 0
+            found = mapped.base[start : start + length]
+            assert found.endswith(picture[part].tobytes())
+            assert len(found) < picture[part].nbytes + mmap.PAGESIZE
 
 
 @pytest.mark.parametrize("blocks", [[], [3], [5]])

@@ -22,8 +22,8 @@ import numpy as np
 
 from btfpipe import store
 from btfpipe.compression.entropy import decode_planes, encode_planes
-from btfpipe.compression.model import Model, measured_error, tables
-from btfpipe.compression.svd import compress_svd
+from btfpipe.compression.model import Model, comparison_bytes, measured_error, tables
+from btfpipe.compression.svd import SvdModel, factorise
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -136,7 +136,7 @@ def compress_coded(
     Parameters
     ----------
     sample : Appearance
-        Read about five times.
+        Read about four times.
     ratio : float, optional
         Bytes of the uncompressed pictures (see `raw_bytes`) over those of the file. By default 100, but samples so small
         that this would leave nothing get what they need.
@@ -181,7 +181,7 @@ def compress_coded(
         n_terms = max(_TERMS, plain, min(12 * plain, 2 * _TERMS))
     most = min(n_terms, sample.shape[0] * sample.shape[1], 3 * sample.n_pairs)
     # factors, transformed, quantised, with what that takes, and unpacked again
-    need = (104 << 20) + 4 * 7 * most * lengths
+    need = (104 << 20) + 4 * 4 * most * lengths + comparison_bytes(sample)
     if need > memory:
         raise InputError(
             f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
@@ -196,13 +196,14 @@ def compress_coded(
         reads = total
         report(done, total + n_pairs)
 
-    factors = compress_svd(
-        _Roots(sample), n_terms, iterations=1, precision="single", seed=seed, threads=threads, memory=memory,
-        on_progress=first,
+    roots = _Roots(sample)
+    texture, angular, facts = factorise(
+        roots, n_terms, measure=False, iterations=1, precision="single", seed=seed, threads=threads,
+        memory=memory, on_progress=first,
     )  # fmt: skip
     with single_threaded_blas():
-        packer = _Packer(factors)
-        del factors
+        packer = _Packer(SvdModel(texture.reshape(*sample.shape, -1), angular, roots, facts))
+        del texture, angular
         model = packer.fit(target_bytes, spare, threads)
     model.about |= measured_error(
         model,
@@ -266,11 +267,12 @@ class _Packer:
         )  # fmt: skip
         n = factors.n_terms
         texture = factors.texture_factors.transpose(2, 0, 1)
-        weight = np.sqrt((texture.astype(np.float64) ** 2).sum(axis=(1, 2)))
+        weight = np.sqrt([np.square(plane, dtype=np.float64).sum() for plane in texture])
         weight[weight == 0] = 1
         self.singular = (weight**2).astype(np.float32)
         weight = weight.astype(np.float32)[:, None, None]
-        self.texture = dctn(texture, axes=(1, 2), norm="ortho") * weight
+        self.texture = dctn(texture, axes=(1, 2), norm="ortho")
+        self.texture *= weight
         angular = factors.angular_factors.transpose(2, 0, 1) * weight
         colour = _principal_axes(angular, 2)
         self.tables = {"colour": colour}
@@ -354,7 +356,8 @@ def _quantise(values, step):
     sizes = np.abs(values)
     sizes *= 1 / step
     sizes += _ROUND
-    return np.copysign(np.floor(sizes, out=sizes), values).astype(np.int32)
+    np.floor(sizes, out=sizes)
+    return np.copysign(sizes, values, out=sizes).astype(np.int32)
 
 
 def _live(planes, axis, least=1):
@@ -374,7 +377,7 @@ def _file_bytes(members, source, about):
         writer.array(name, getattr(source, name))
     writer.about(about)
     writer.close()
-    return len(file.getvalue())
+    return file.getbuffer().nbytes
 
 
 def _unpack(members, source, about):

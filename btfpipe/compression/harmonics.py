@@ -21,6 +21,7 @@ import math
 import numpy as np
 from numba import njit
 
+from btfpipe import store
 from btfpipe.compression.model import Model
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
@@ -192,7 +193,7 @@ def compress_harmonics(
         Never changes the result.
     memory : int
         Bytes of private memory to stay within. Never changes the result; with little of it the coefficients are found
-        twice instead of being kept.
+        twice instead of being kept, and the codes wait in a temporary file (`store.scratch`) until they are saved.
     on_progress : callable, optional
         Called with (scan lines done, scan lines to do).
 
@@ -383,6 +384,9 @@ class _Lines:
         # two bands: the next is read while the last is still held; values that are no 8-bit codes are decoded at once
         line = 2 * self.cols * pairs * (3 if self.table is not None else 36)
         fixed = _PROCESS_BYTES + all_terms * texels
+        self.make = np.empty
+        if fixed + line + each > memory:
+            fixed, self.make = _PROCESS_BYTES, store.scratch
         need = fixed + line + each
         if need > memory:
             raise InputError(
@@ -426,6 +430,7 @@ class _Lines:
             values = self.sample.texels(rows, cols)
             values = values.reshape(-1, self.cols, self.sample.n_pairs, 3).swapaxes(1, 2)
             return np.ascontiguousarray(values)
+        store.will_read(self.sample.codes, band)
         codes = np.ascontiguousarray(self.sample.codes[:, band].swapaxes(0, 1))
         if self.table is not None:
             return codes
@@ -473,7 +478,7 @@ class _Lines:
 
     def quantise(self, minimum, maximum):
         """Codes (rows, cols, 3, view terms, light terms), and the sum of their squared errors."""
-        codes = np.empty((self.rows, self.cols, 3, *self.terms), np.uint8)
+        codes = self.make((self.rows, self.cols, 3, *self.terms), np.uint8)
         step = step_of(minimum, maximum)
         views, lights = (fit.basis for fit in self.fits)
 

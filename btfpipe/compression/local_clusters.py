@@ -3,13 +3,19 @@
 Like k-means, but a cluster is a mean and a few principal directions, and a point belongs to the cluster that
 reconstructs it best. Two steps in turn, neither of which can raise the error: each cluster is fitted to
 its points, each point goes to its best cluster.
+
+A round costs points times clusters, and large samples have more of both. Beyond some number of points a cluster, the
+clusters are found from a random part of the points; a few rounds over all of them follow.
 """
 
 import numpy as np
+from numba import njit
 
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
-_POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
+POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it
+_MANY, _EACH = 1 << 16, 128  # more points than the first, and than so many a cluster, are too many
+_LAST = 3  # rounds over all points then
 _STARTS = 3  # the best of so many: the outcome varies by some per cent with the first means
 _ROUNDS = 60
 _OPENING = 16  # rounds in which the directions are let in
@@ -49,6 +55,9 @@ def local_clusters(points, clusters, terms, *, given=None, seed=0, threads=1, on
     """
     rng = np.random.default_rng(seed)
     best = np.inf
+    every, most = points, max(_MANY, _EACH * clusters)
+    if len(points) > most:
+        points = points[np.sort(rng.choice(len(points), most, replace=False))]
     with single_threaded_blas():
         for start in range(_STARTS if clusters > 1 else 1):
 
@@ -60,6 +69,12 @@ def local_clusters(points, clusters, terms, *, given=None, seed=0, threads=1, on
             found, error = _alternate(points, means, terms, threads, report)
             if error < best:
                 labels, best = found, error
+        if len(every) > most:
+            means, bases = _fit(points, labels, clusters, terms, threads)
+            points, (labels, best) = every, _assign(every, means, bases, threads)
+            for _ in range(_LAST):
+                means, bases = _fit(points, labels, clusters, terms, threads)
+                labels, best = _assign(points, means, bases, threads)
         bases = _fit(points, labels, clusters, terms if given is None else given, threads)[1]
     if on_progress is not None:
         on_progress(_STARTS * _ROUNDS, _STARTS * _ROUNDS)
@@ -110,24 +125,43 @@ def _assign(points, means, bases, threads):
     offsets = [mean @ basis for mean, basis in zip(means, bases, strict=True)]
     offsets = np.concatenate(offsets).astype(np.float32)
     mean_squares = np.vecdot(means, means)
-    starts = np.concatenate([[0], np.cumsum(widths)])
+    ends = len(means) + np.cumsum([0, *widths])
     clusters = len(means)
 
     def work(part):
         some = points[part]
-        inner = some @ frame
-        errors = np.vecdot(some, some)[:, None].astype(np.float64)
-        errors = errors - 2.0 * inner[:, :clusters] + mean_squares
-        along = np.square(inner[:, clusters:] - offsets)
-        for cluster in np.flatnonzero(widths):
-            errors[:, cluster] -= along[:, starts[cluster] : starts[cluster + 1]].sum(axis=1)
-        labels = errors.argmin(axis=1)
-        return labels.astype(np.int32), np.maximum(errors[np.arange(len(some)), labels], 0)
+        labels = np.zeros(len(some), np.int32)
+        errors = np.vecdot(some, some).astype(np.float64)
+        _nearest(some @ frame, mean_squares, offsets, ends, labels, errors)
+        return labels, errors
 
-    results = list(ordered_map(work, blocks(len(points), _POINTS), threads))
+    results = list(ordered_map(work, blocks(len(points), POINTS), threads))
     labels, errors = (np.concatenate(parts) for parts in zip(*results, strict=True))
     _fill_empty(labels, errors, clusters)
     return labels, float(errors.sum())
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(inner, mean_squares, offsets, ends, labels, errors):
+    """Fill the best cluster of each point and its squared error; `errors` come as the points' squares.
+
+    `inner` (n, clusters + directions) are inner products with the means and with the directions of all clusters, cluster k's
+    from ``ends[k]`` on; `offsets` those of its mean with them.
+    """
+    clusters = len(mean_squares)
+    for p in range(len(labels)):
+        least = np.inf
+        for k in range(clusters):
+            error = errors[p] - 2.0 * inner[p, k] + mean_squares[k]
+            along = np.float32(0)
+            for j in range(ends[k], ends[k + 1]):
+                d = inner[p, j] - offsets[j - clusters]
+                along += d * d
+            error -= along
+            if error < least:
+                least = error
+                labels[p] = k
+        errors[p] = max(least, 0.0)
 
 
 def _fill_empty(labels, errors, clusters):

@@ -5,11 +5,19 @@ import math
 
 import numpy as np
 
-from btfpipe.compression.svd import _PROCESS_BYTES, _require_range, planar_pictures
+from btfpipe.compression.local_clusters import POINTS
+from btfpipe.compression.model import comparison_bytes
+from btfpipe.compression.svd import (
+    _PROCESS_BYTES,
+    LEAST_PICTURES,
+    _require_range,
+    planar_pictures,
+)
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map
 
 REDUCED_TERMS = 150  # of each sample, for the clustering
+JOINT_TERMS = 512  # of several samples together
 OVERSAMPLING = 6
 TYPES = {  # of the bases and the coordinates
     "half": (np.dtype(np.float16), np.dtype(np.float16)),
@@ -27,7 +35,7 @@ def plan(samples, clusters, components, precision, threads, memory):
     Only the first has a part in the result, and it depends on the samples alone.
     """
     pairs, texels = samples[0].n_pairs, sum(math.prod(sample.shape) for sample in samples)
-    step = max(1, _DECODED_BYTES // (12 * texels))
+    step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * texels))
     step = min(step, math.ceil(pairs / _GROUPS))
     width = components + OVERSAMPLING
     basis, coordinate = (dtype.itemsize for dtype in TYPES[precision])
@@ -35,11 +43,8 @@ def plan(samples, clusters, components, precision, threads, memory):
     fixed = _PROCESS_BYTES + 4 * 4 * width * texels
     fixed += (1 + components) * (3 * pairs * clusters * basis + texels * coordinate)
     each = 4 * width * texels + 3 * 12 * step * texels  # a partial sum; pictures being decoded
-    # before that: what the samples are reduced to, and points made of it
-    reduced = _PROCESS_BYTES + 4 * min(REDUCED_TERMS, texels) * (
-        2 * texels + 3 * pairs * len(samples)
-    )
-    need = max(fixed + each, reduced)
+    each = max(each, comparison_bytes(max(samples, key=lambda sample: math.prod(sample.shape))))
+    need = max(fixed + each, *_reduced_bytes(samples, clusters * (1 + components)))
     if need > memory:
         raise InputError(
             f"{clusters} clusters of {components} components and {texels} texels need"
@@ -48,6 +53,25 @@ def plan(samples, clusters, components, precision, threads, memory):
         )
     at_once = int(min((memory - fixed) // each, 2 * threads))
     return step, at_once, min(threads, at_once)
+
+
+def _reduced_bytes(samples, directions):
+    """Private memory taken before the passes: to reduce the samples, to make points of that, to cluster them."""
+    texels = [math.prod(sample.shape) for sample in samples]
+    rows = 3 * samples[0].n_pairs
+    terms = min(REDUCED_TERMS, max(texels), rows)
+    several = len(samples) > 1
+    kept = 4 * terms * (sum(texels) + rows * len(samples) * several)
+    # four arrays of the largest one's columns, and six of the weights
+    last = 4 * (terms + 10) * (4 * max(texels) + 6 * rows)
+    points = 4 * sum(texels) * (min(JOINT_TERMS, terms * len(samples)) if several else terms)
+    gram = 24 * (terms * len(samples)) ** 2 * several
+    return (
+        _PROCESS_BYTES + kept * several + last,
+        _PROCESS_BYTES + kept + gram,
+        _PROCESS_BYTES + 4 * terms * sum(texels) + points * (2 if several else 1),
+        _PROCESS_BYTES + points + 12 * POINTS * directions,
+    )
 
 
 class Passes:

@@ -12,9 +12,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfpipe.compression.local_clusters import local_clusters
-from btfpipe.compression.local_passes import OVERSAMPLING, REDUCED_TERMS, TYPES, Passes, plan
+from btfpipe.compression.local_passes import (
+    JOINT_TERMS,
+    OVERSAMPLING,
+    REDUCED_TERMS,
+    TYPES,
+    Passes,
+    plan,
+)
 from btfpipe.compression.model import Model, measured_error
-from btfpipe.compression.svd import compress_svd
+from btfpipe.compression.svd import factorise
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.resample import Resampled
@@ -23,7 +30,6 @@ from btfpipe.sample.resample import Resampled
 # this gives 16 clusters to a sample of 128 x 128 texels and 81 x 81 directions, and 250 to fifteen with 151 x 151,
 # the numbers of the paper.
 DEFAULT_RATIO = 54
-_JOINT_TERMS = 512  # of several samples together
 _DIRECTIONS = ("light_directions", "view_directions", "light_index", "view_index")
 _FACTS = ("toroidal", "texels_per_mm", "absolute")
 
@@ -450,15 +456,16 @@ def _reduced(samples, names, seed, threads, memory, progress):
     textures, angular = [], []
     for sample, name in zip(samples, names, strict=True):
         try:
-            model = compress_svd(
-                sample, REDUCED_TERMS, iterations=1, precision="single", seed=seed, threads=threads,
-                memory=memory, on_progress=progress.part(3 * sample.n_pairs),
+            texture, weights, facts = factorise(
+                sample, REDUCED_TERMS, measure=False, iterations=1, precision="single", seed=seed,
+                threads=threads, memory=memory, on_progress=progress.part(3 * sample.n_pairs),
             )  # fmt: skip
         except InputError as error:
             raise InputError(f"{name}: {error}" if len(samples) > 1 else str(error)) from error
-        root = np.sqrt(np.array(model.about["singular_values"])).astype(np.float32)
-        textures.append((model.texture_factors.reshape(-1, model.n_terms), root))
-        angular.append((model.angular_factors.reshape(-1, model.n_terms), root))
+        root = np.sqrt(np.array(facts["singular_values"])).astype(np.float32)
+        textures.append((texture, root))
+        if len(samples) > 1:
+            angular.append((weights.reshape(-1, len(root)), root))
     if len(samples) == 1:
         points = textures[0][0] * textures[0][1]
     else:
@@ -470,7 +477,7 @@ def _reduced(samples, names, seed, threads, memory, progress):
                 gram += some.T @ some
             del angular
             values, turn = np.linalg.eigh(gram)
-            kept = np.flatnonzero(values[::-1][:_JOINT_TERMS] > 1e-9 * max(values[-1], 1e-300))
+            kept = np.flatnonzero(values[::-1][:JOINT_TERMS] > 1e-9 * max(values[-1], 1e-300))
             values, turn = values[::-1][kept], turn[:, ::-1][:, kept]
             turn = turn * np.sqrt(values)
             parts = []

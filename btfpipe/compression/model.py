@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
+from numba import njit
 
 from btfpipe import store
 from btfpipe.errors import InputError
@@ -12,6 +13,7 @@ from btfpipe.sample.appearance import Appearance
 
 _TABLES = ("light_directions", "view_directions", "light_index", "view_index")
 _BLOCK_BYTES = 4 << 20  # linear pictures compared at a time
+_LEAST_PICTURES = 8  # however large: what a Model does once for several is then little
 
 
 class Model(Appearance):
@@ -121,16 +123,12 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
     texels = sample.shape[0] * sample.shape[1]
 
     def work(pairs):
-        reference = np.asarray(sample.pictures(pairs), np.float32).reshape(-1)
-        error = reference - np.asarray(model.pictures(pairs), np.float32).reshape(-1)
-        squares = (
-            float(np.square(a, dtype=np.float64).sum(dtype=np.float64)) for a in (error, reference)
-        )
-        return pairs.stop, *squares
+        pictures = (appearance.pictures(pairs) for appearance in (sample, model))
+        return pairs.stop, *_squares(*(np.asarray(p, np.float32).reshape(-1) for p in pictures))
 
     total, energy = 0.0, 0.0
     with single_threaded_blas():
-        parts = blocks(sample.n_pairs, max(1, _BLOCK_BYTES // (12 * texels)))
+        parts = blocks(sample.n_pairs, _pictures_at_once(sample))
         for done, squared, square in ordered_map(work, parts, threads):
             total += squared
             energy += square
@@ -140,3 +138,25 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
         "rmse": math.sqrt(total / (3 * texels * sample.n_pairs)),
         "relative_error": math.sqrt(total / energy) if energy > 0 else 0.0,
     }
+
+
+def comparison_bytes(sample):
+    """Private memory that `measured_error` takes a thread, above what the Model unpacks for itself."""
+    return 5 * 12 * math.prod(sample.shape) * _pictures_at_once(sample)
+
+
+def _pictures_at_once(sample):
+    wanted = max(_LEAST_PICTURES, _BLOCK_BYTES // (12 * math.prod(sample.shape)))
+    return min(sample.n_pairs, wanted)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _squares(reference, values):
+    """Sums of the squared differences and of the squared references (n,), in double precision."""
+    squared = 0.0
+    square = 0.0
+    for i in range(len(reference)):
+        error = np.float64(reference[i] - values[i])
+        squared += error * error
+        square += np.float64(reference[i]) * np.float64(reference[i])
+    return squared, square

@@ -23,6 +23,8 @@ from btfpipe.sample.transfer import decode_table
 _OVERSAMPLING = 10
 _GROUPS = 32  # partial sums a pass, added in order; fixed, so that threads and memory never show
 _DECODED_BYTES = 6 << 20  # linear pictures in a thread's hands; fixed, as sums hang on it
+LEAST_PICTURES = 8  # in a thread's hands, however large: products with fewer only wait for memory
+_TEXELS = 1 << 14  # whose sums are added at a time; fixed
 _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
 _MOST_ITERATIONS = 8
@@ -206,7 +208,8 @@ def factorise(
     with single_threaded_blas():
         basis = rng.standard_normal((texels, width), np.float32)
         for _ in range(_FIRST_PASSES):
-            basis = passes.power(_orthonormal(basis), first)[1]
+            basis = _orthonormal(basis)
+            basis = passes.power(basis, first)[1]
         shift = 0.0
         for iteration in range(most_passes):
             basis = _orthonormal(basis)
@@ -220,13 +223,16 @@ def factorise(
             if (iterations is None and excess <= _GOOD_ENOUGH) or iteration + 1 == most_passes:
                 break
             shift = max(shift, float(values[-1]) / 2)
-            basis = image - np.float32(shift) * basis
+            basis *= np.float32(shift)
+            image -= basis
+            basis, image = image, None  # four arrays of this size are all there may be
         singular = np.sqrt(values[:n_terms])
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
         root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
         texture = basis @ (turn * root).astype(np.float32)
         angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
+        del basis, image
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
         texture, angular = texture.astype(dtype), angular.astype(dtype)
@@ -289,9 +295,11 @@ def _excess(basis, image, values, turn, energy):
     """
     width = basis.shape[1]
     kept = values[: turn.shape[1]]
-    residual = image @ turn.astype(np.float32)
-    residual -= (basis @ turn.astype(np.float32)) * kept.astype(np.float32)
-    squares = np.square(residual, dtype=np.float64).sum(axis=0)
+    turn, squares = turn.astype(np.float32), 0.0
+    for some in blocks(len(basis), _TEXELS):
+        residual = image[some] @ turn
+        residual -= (basis[some] @ turn) * kept.astype(np.float32)
+        squares = squares + np.square(residual, dtype=np.float64).sum(axis=0)
     outside = values[-1] if width > turn.shape[1] else 0.0
     rounding = 1e-7 * energy
     error = max(energy - kept.sum(), 0.0)
@@ -319,23 +327,21 @@ class _Passes:
         self.total, self.on_progress = total, on_progress
         self.texels = sample.shape[0] * sample.shape[1]
         # pictures decoded at a time
-        self.step = max(1, _DECODED_BYTES // (12 * self.texels))
+        self.step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * self.texels))
         self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
-        # basis, its successor and QR's copies; the weights, and in double precision
         vectors = 4 * width * self.texels  # one array of as many columns as the subspace
         # the weights, also in double precision and turned; then what QR takes, or a pass
         fixed = _PROCESS_BYTES + 4 * width * 6 * channels * sample.n_pairs
-        each = (
-            2 * vectors + 36 * self.step * self.texels
-        )  # two partial sums; pictures being decoded
-        need = fixed + max(7 * vectors, 4 * vectors + each)
+        each = vectors + 36 * self.step * self.texels  # a partial sum; pictures being decoded
+        each += 4 * width * min(_TEXELS, self.texels)
+        need = fixed + max(4 * vectors, 2 * vectors + each)
         if need > memory:
             raise InputError(
                 f"{width} vectors of {self.texels} texels need {math.ceil(need / (1 << 20))} MB; --memory"
                 f" allows {memory >> 20} MB. Raise it, or ask for fewer components."
             )
-        self.at_once = int(min((memory - fixed - 4 * vectors) // each, 2 * threads))
+        self.at_once = int(min((memory - fixed - 2 * vectors) // each, 2 * threads))
         self.threads = min(threads, self.at_once)
 
     def _groups(self, work, chosen=None):
@@ -372,11 +378,12 @@ class _Passes:
         energy = 0.0
 
         def work(steps):
-            parts, sum_, share, squares = [], np.zeros_like(image), np.empty_like(image), 0.0
+            parts, sum_, squares = [], np.zeros_like(image), 0.0
             for pairs in steps:
                 values = self.rows(self.sample, pairs)
                 parts.append(values @ basis)
-                sum_ += np.matmul(values.T, parts[-1], out=share)
+                for some in blocks(self.texels, _TEXELS):
+                    sum_[some] += values[:, some].T @ parts[-1]
                 squares += _squares(values)
             return np.concatenate(parts), sum_, squares
 
@@ -388,7 +395,7 @@ class _Passes:
 
     def squared_error(self, texture, angular):
         """Sum of squared differences between the matrix and the product of its stored factors."""
-        texture = np.asarray(texture, np.float32).T.copy()
+        texture = np.ascontiguousarray(texture.T, np.float32)
 
         def work(steps):
             total = 0.0
@@ -407,16 +414,25 @@ def _squares(values):
     return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
-def planar_pictures(sample, pairs):
-    """Linear pictures as rows (pairs * 3, texels) float32, a channel a row; 8-bit codes by table."""
+def planar_pictures(sample, pairs, lines=slice(None)):
+    """Linear pictures as rows (pairs * 3, texels) float32, a channel a row; 8-bit codes by table.
+
+    Of the texels, those of some scan lines (a slice); of a Sample, no others are read.
+    """
     codes = getattr(sample, "codes", None)
-    if codes is None or codes.dtype != np.uint8 or sample.gain is not None:
-        values = sample.pictures(pairs)
-        return np.ascontiguousarray(values.transpose(0, 3, 1, 2)).reshape(3 * len(values), -1)
-    codes = np.asarray(codes[pairs]).reshape(-1, sample.shape[0] * sample.shape[1], 3)
-    values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
-    decode_planar(codes, decode_table(np.uint8, sample.transfer, sample.scale), values)
-    return values.reshape(3 * len(codes), -1)
+    if codes is not None and codes.dtype == np.uint8 and sample.gain is None:
+        codes = np.ascontiguousarray(codes[pairs, lines])
+        codes = codes.reshape(len(codes), -1, 3)
+        values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
+        decode_planar(codes, decode_table(np.uint8, sample.transfer, sample.scale), values)
+        return values.reshape(3 * len(codes), -1)
+    if codes is None:
+        values = sample.pictures(pairs)[:, lines]
+    else:
+        values = sample.decode(np.asarray(codes[pairs, lines]))
+        if sample.gain is not None:
+            values = values * sample.gain[lines]
+    return np.ascontiguousarray(values.transpose(0, 3, 1, 2)).reshape(3 * len(values), -1)
 
 
 @njit(cache=True, nogil=True)

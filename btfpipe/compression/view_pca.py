@@ -10,15 +10,14 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model, measured_error
+from btfpipe import store
+from btfpipe.compression.model import Model, comparison_bytes, measured_error
 from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.shading import PairShader, corners
 
-_COLUMNS = (
-    8192  # of a view's matrix, taken into double precision at a time; fixed, as sums hang on it
-)
+_DECODED_BYTES = 6 << 20  # of a view's pictures at a time; fixed, as sums hang on it
 _TYPES = {  # of the mean and the eigen-textures
     "half": (np.float16, np.float16),
     "single": (np.float32, np.float32),
@@ -110,7 +109,8 @@ def compress_view_pca(
     Parameters
     ----------
     sample : Appearance
-        A product of views and lights; read view by view, twice.
+        A product of views and lights; read view by view, three times: a view's scan lines for its Gram matrix and for
+        its textures, and its pictures for the error.
     components : int
         Eigen-textures a view, at least 1. The lights of a view, less its mean, have at most lights - 1; terms
         that are rounding noise in every view are left out too.
@@ -121,7 +121,8 @@ def compress_view_pca(
     threads : int
         Never changes the result.
     memory : int
-        Bytes of private memory to stay within; limits the views worked on at a time, never the result.
+        Bytes of private memory to stay within; limits the views worked on at a time, never the result. A Model too
+        large for it is kept in a temporary file (`store.scratch`) until it is saved.
     on_progress : callable, optional
         Called with (pictures read, pictures to read).
 
@@ -146,20 +147,21 @@ def compress_view_pca(
     lights, views = len(sample.light_directions), len(sample.view_directions)
     texels = sample.shape[0] * sample.shape[1]
     kept = min(components, lights - 1, 3 * texels)
-    means = np.empty((views, *sample.shape, 3), _TYPES[precision][0])
-    textures = np.empty((views, kept, *sample.shape, 3), _TYPES[precision][1])
+    shapes = ((views, *sample.shape, 3), (views, kept, *sample.shape, 3))
     step = 127 if precision == "byte" else 1
-    size = means.nbytes + textures.nbytes
-    threads = _views_at_once(lights, views, texels, kept, size, threads, memory)
+    threads, make = _plan(sample, shapes, _TYPES[precision], threads, memory)
+    means, textures = (
+        make(shape, dtype) for shape, dtype in zip(shapes, _TYPES[precision], strict=True)
+    )
     weights = np.empty((views, lights, 1 + kept), np.float32)
 
     def work(view):
-        pairs = slice(view * lights, (view + 1) * lights)
-        values = planar_pictures(sample, pairs).reshape(lights, -1)
-        terms, weights[view], rank = _view_terms(values, kept)
-        terms = terms.reshape(-1, 3, *sample.shape).transpose(0, 2, 3, 1)
-        means[view] = terms[0]
-        textures[view] = np.round(terms[1:] * step) if step > 1 else terms[1:]
+        terms, weights[view], rank = _view_terms(
+            _strips(sample, view, lights), lights, sample.shape, kept
+        )
+        means[view] = terms[0].transpose(1, 2, 0)
+        for texture, term in zip(textures[view], terms[1:], strict=True):
+            texture[:] = (np.round(term * step) if step > 1 else term).transpose(1, 2, 0)
         weights[view, :, 1:] /= step
         return view, rank
 
@@ -176,7 +178,7 @@ def compress_view_pca(
             f"the views have at most {most} terms beside their mean: {components - most} of the"
             f" {components} components left out"
         )
-        textures, weights = textures[:, :most].copy(), weights[:, :, : 1 + most].copy()
+        textures, weights = textures[:, :most], weights[:, :, : 1 + most].copy()
     model = ViewPcaModel(means, textures, weights, sample)
     error = measured_error(
         model,
@@ -194,21 +196,55 @@ def compress_view_pca(
     return model
 
 
-def _views_at_once(lights, views, texels, terms, model_bytes, threads, memory):
-    """How many views fit the memory, at most `threads`."""
-    fixed = _PROCESS_BYTES + model_bytes
-    # the values and a copy on the way to them; the mean in double precision; the terms twice
-    each = 12 * texels * (2 * lights + 2 + 2 * (1 + terms)) + 16 * lights * _COLUMNS
-    if fixed + each > memory:
+def _plan(sample, shapes, dtypes, threads, memory):
+    """How many views fit the memory, at most `threads`, and what makes the Model's arrays: in memory, or in a file."""
+    (rows, cols), lights = sample.shape, len(sample.light_directions)
+    texels, terms = rows * cols, 1 + shapes[1][1]
+    # the textures, one of them transposed; scan lines, centred, and in double precision
+    each = 12 * texels * (terms + 2) + 40 * lights * cols * min(rows, _lines_at_once(lights, cols))
+    if not hasattr(sample, "codes"):
+        each += 2 * 12 * lights * texels  # they come with all scan lines
+    each = max(each, comparison_bytes(sample) + 12 * texels * terms)
+    size = sum(
+        math.prod(shape) * np.dtype(dtype).itemsize
+        for shape, dtype in zip(shapes, dtypes, strict=True)
+    )
+    if _PROCESS_BYTES + each > memory:
         raise InputError(
-            f"a view of {lights} pictures of {texels} texels, and textures for {views} views, need"
-            f" {math.ceil((fixed + each) / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
+            f"views of {lights} pictures of {texels} texels need"
+            f" {math.ceil((_PROCESS_BYTES + each) / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
             " or ask for fewer components."
         )
-    return int(min((memory - fixed) // each, threads))
+    free = memory - _PROCESS_BYTES
+    inside = size + each <= free
+    threads = int(min((free - size * inside) // each, threads))
+    return threads, np.empty if inside else store.scratch
 
 
-def _view_terms(values, terms):
+def _lines_at_once(lights, cols):
+    return max(1, _DECODED_BYTES // (12 * lights * cols))
+
+
+def _strips(sample, view, lights):
+    """Yields, each time it is called, slices of scan lines and a view's values there (lights, 3, lines, cols) float32."""
+    pairs = slice(view * lights, (view + 1) * lights)
+    rows, cols = sample.shape
+    whole = None
+    if not hasattr(sample, "codes"):
+        whole = planar_pictures(sample, pairs).reshape(lights, 3, rows, cols)
+
+    def strips():
+        for lines in blocks(rows, _lines_at_once(lights, cols)):
+            if whole is None:
+                values = planar_pictures(sample, pairs, lines).reshape(lights, 3, -1, cols)
+            else:
+                values = whole[:, :, lines].copy()
+            yield lines, values
+
+    return strips
+
+
+def _view_terms(strips, lights, shape, terms):
     """Mean and eigen-textures of one view.
 
     The eigen-textures are the projections of the centred pictures on the first eigenvectors of their Gram matrix; the
@@ -217,27 +253,30 @@ def _view_terms(values, terms):
 
     Parameters
     ----------
-    values : (lights, n) float32
-        Centred in place.
+    strips : callable
+        See `_strips`.
+    lights : int
+    shape : (int, int)
     terms : int
 
     Returns
     -------
-    textures : (1 + terms, n) float32
+    textures : (1 + terms, 3, rows, cols) float32
         Each of largest magnitude 1, or zero.
     weights : (lights, 1 + terms) float32
     rank : int
         Terms above rounding, at most `terms`; those beyond are zero.
     """
-    lights = len(values)
-    mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
-    energy = lights * float(np.vecdot(mean.astype(np.float64), mean))
-    if not math.isfinite(energy):
-        raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
-    values -= mean
-    gram = np.zeros((lights, lights))
-    for part in blocks(values.shape[1], _COLUMNS):
-        columns = values[:, part].astype(np.float64)
+    textures = np.empty((1 + terms, 3, *shape), np.float32)
+    gram, energy = np.zeros((lights, lights)), 0.0
+    for lines, values in strips():
+        mean = values.mean(axis=0, dtype=np.float64)
+        energy += lights * float(np.square(mean).sum())
+        if not math.isfinite(energy):
+            raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+        textures[0, :, lines] = mean
+        values -= textures[0, :, lines]
+        columns = values.reshape(lights, -1).astype(np.float64)
         gram += columns @ columns.T
     energy += float(np.trace(gram))
     eigenvalues, vectors = np.linalg.eigh(gram)
@@ -245,11 +284,16 @@ def _view_terms(values, terms):
     rank = int((eigenvalues > _NOISE**2 * energy).sum())
     vectors = vectors.astype(np.float32)
     vectors[:, rank:] = 0
-    textures = np.concatenate([mean[None], vectors.T @ values])
+    for lines, values in strips():
+        values -= textures[0, :, lines]
+        strip = vectors.T @ values.reshape(lights, -1)
+        textures[1:, :, lines] = strip.reshape(terms, *values.shape[1:])
     weights = np.concatenate([np.ones((lights, 1), np.float32), vectors], axis=1)
-    scale = np.abs(textures).max(axis=1)
-    textures /= np.where(scale > 0, scale, 1)[:, None]
-    return textures, weights * scale, rank
+    for term, texture in enumerate(textures):
+        scale = np.float32(max(texture.max(), -texture.min()))
+        texture /= scale if scale > 0 else 1
+        weights[:, term] *= scale
+    return textures, weights, rank
 
 
 class ViewPcaShader(PairShader):

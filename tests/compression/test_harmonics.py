@@ -197,6 +197,22 @@ def test_threads_and_memory_never_show(rng):
         assert model.about == models[0].about
 
 
+def test_with_the_least_memory_the_codes_wait_in_a_file(rng, tmp_path):
+    sample = smooth_sample(rng, 3, 70, noise=0.02)
+    for memory in range(140 << 20, 200 << 20, 64 << 10):
+        try:
+            model = compress_harmonics(sample, 16, 16, memory=memory)
+            break
+        except InputError:
+            continue
+    assert isinstance(model.coefficient_codes, np.memmap)
+    usual = compress_harmonics(sample, 16, 16)
+    assert not isinstance(usual.coefficient_codes, np.memmap)
+    for name, one in zip("ab", (model, usual), strict=True):
+        one.save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
 def test_codes_gain_and_models_are_read_alike(make_sample, rng):
     gain = (0.5 + rng.random((4, 5, 3))).astype(np.float32)
     coded = make_sample(4, 5, dtype=np.uint8, transfer="srgb", scale=1.7)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from btfpipe.compression import compress, open_appearance
+from btfpipe.compression import local_clusters as local_clusters_module
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_pca import LocalPcaModel, compress_local_pca
 from btfpipe.directions import bonn81, from_angles
@@ -122,6 +123,45 @@ def test_neither_step_of_the_clustering_raises_the_error(rng):
     assert spread < ((points - points.mean(axis=0)) ** 2).sum() * 0.85
 
 
+def test_the_best_cluster_is_found_as_by_comparing_all(rng):
+    points = rng.standard_normal((300, 9)).astype(np.float32)
+    means = rng.standard_normal((4, 9))
+    widths = (3, 0, 2, 3)  # a cluster of one point has no directions
+    bases = [np.linalg.qr(rng.standard_normal((9, n)))[0].astype(np.float32) for n in widths]
+    residual = []
+    for mean, basis in zip(means, bases, strict=True):
+        centred = points - mean
+        residual.append(((centred - centred @ basis @ basis.T) ** 2).sum(axis=1))
+    labels, error = local_clusters_module._assign(points, means, bases, 1)
+    np.testing.assert_array_equal(labels, np.argmin(residual, axis=0))
+    assert error == pytest.approx(np.min(residual, axis=0).sum(), rel=1e-5)
+
+
+def test_clusters_of_many_points_are_found_from_a_part_of_them(rng, monkeypatch):
+    centres = 6 * rng.standard_normal((5, 10))
+    axes = np.stack([np.linalg.qr(rng.standard_normal((10, 2)))[0] for _ in range(5)])
+    which = rng.integers(5, size=4000)
+    along = rng.standard_normal((4000, 2))
+    points = centres[which] + np.einsum("nk,ndk->nd", along, axes[which])
+    points = (points + 0.01 * rng.standard_normal(points.shape)).astype(np.float32)
+    whole = local_clusters(points, 5, 2, seed=3)
+    monkeypatch.setattr(local_clusters_module, "_MANY", 400)
+    monkeypatch.setattr(local_clusters_module, "_EACH", 40)
+    seen = []
+    assign = local_clusters_module._assign
+    monkeypatch.setattr(
+        local_clusters_module, "_assign", lambda p, *rest: seen.append(len(p)) or assign(p, *rest)
+    )
+    parts = [local_clusters(points, 5, 2, seed=3, threads=threads) for threads in (1, 3)]
+    assert seen.count(4000) == 2 * 4
+    assert set(seen) == {400, 4000}
+    np.testing.assert_array_equal(parts[0][0], parts[1][0])
+    assert len(parts[0][0]) == 4000
+    assert parts[0][2] == parts[1][2] <= 1.05 * whole[2]
+    for basis, own in zip(parts[0][1], parts[1][1], strict=True):
+        assert basis.tobytes() == own.tobytes()
+
+
 def test_more_terms_and_more_clusters_are_better(patchy_sample):
     sample = patchy_sample(regions=8, rank=6, shape=(20, 20))
     by_terms = [
@@ -172,7 +212,7 @@ def test_threads_and_memory_never_show(patchy_sample):
     samples = [patchy_sample(shape=(50, 47)), patchy_sample(shape=(12, 15))]
     models = [
         compress_local_pca(samples, clusters=7, components=3, threads=threads, memory=memory)
-        for threads, memory in ((1, 2 << 30), (2, 2 << 30), (3, 114 << 20))
+        for threads, memory in ((1, 2 << 30), (2, 2 << 30), (3, 116 << 20))
     ]
     for model in models[1:]:
         for name, array in model.arrays().items():

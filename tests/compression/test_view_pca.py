@@ -1,13 +1,15 @@
 """Per-view PCA against LAPACK's SVD of each view, and its promises about bytes, memory and bad input."""
 
+import errno
 import itertools
+import os
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from btfpipe.compression import open_appearance
+from btfpipe.compression import open_appearance, view_pca
 from btfpipe.compression.view_pca import ViewPcaModel, compress_view_pca
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
@@ -110,6 +112,37 @@ def test_threads_and_memory_never_show(noisy_sample):
         for name, array in model.arrays().items():
             assert array.tobytes() == models[0].arrays()[name].tobytes(), name
         assert model.about == models[0].about
+
+
+def test_a_model_too_large_for_the_memory_waits_in_a_file(noisy_sample, tmp_path, monkeypatch):
+    sample = noisy_sample(60, 61, dtype=np.uint8, transfer="srgb", n_views=70)
+    small = 127 << 20  # the work takes 21 MB beside the process, the Model 9
+    models = [compress_view_pca(sample, 5, memory=memory) for memory in (2 << 30, small)]
+    assert not isinstance(models[0].textures, np.memmap)
+    assert isinstance(models[1].textures, np.memmap)
+    for name, model in zip("ab", models, strict=True):
+        model.save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    monkeypatch.setattr(os, "posix_fallocate", no_room)
+    with pytest.raises(InputError, match=r"no room for a temporary file of \d+ MB.*TMPDIR"):
+        compress_view_pca(sample, 5, memory=small)
+
+
+def no_room(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_scan_lines_read_in_parts_are_those_of_the_pictures(noisy_sample, monkeypatch, rng, gain):
+    sample = noisy_sample(9, 7, dtype=np.uint8, transfer="srgb")
+    if gain:
+        sample.gain = rng.uniform(0.5, 1.5, (9, 7, 3)).astype(np.float32)
+    monkeypatch.setattr(view_pca, "_DECODED_BYTES", 12 * 13 * 7 * 2)  # two lines
+    model = compress_view_pca(sample, 3, precision="single")
+    np.testing.assert_allclose(views_of(model), naive(sample, 3), atol=2e-6)
+    # an appearance that has no codes gives whole pictures
+    again = compress_view_pca(model, 3, precision="single")
+    np.testing.assert_allclose(views_of(again), views_of(model), atol=2e-6)
 
 
 def test_terms_beyond_the_lights_are_left_out_with_a_warning(noisy_sample):
