@@ -229,9 +229,9 @@ def factorise(
         singular = np.sqrt(values[:n_terms])
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
-        root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
+        root = np.sqrt(singular)
         texture = basis @ (turn * root).astype(np.float32)
-        angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
+        angular = (flat @ turn / np.where(root > 0, root, 1)).reshape(sample.n_pairs, channels, n_terms)
         del basis, image
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
