@@ -156,7 +156,24 @@ def _squares(reference, values):
     squared = 0.0
     square = 0.0
     for i in range(len(reference)):
-        error = np.float64(reference[i] - values[i])
+        value = np.float64(reference[i])
+        error = value - np.float64(values[i])
         squared += error * error
-        square += np.float64(reference[i]) * np.float64(reference[i])
+        square += value * value
     return squared, square
+
+
+def sum_of_squares(values):
+    """Sum of squares of a contiguous array, in double precision.
+
+    Squares of single precision neither overflow there nor vanish: the sum is finite if the values are, and 0 only if they are.
+    """
+    return _sum_of_squares(values.reshape(-1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _sum_of_squares(values):
+    total = 0.0
+    for i in range(len(values)):
+        total += np.float64(values[i]) * np.float64(values[i])
+    return total

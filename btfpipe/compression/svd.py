@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model
+from btfpipe.compression.model import Model, sum_of_squares
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
@@ -231,7 +231,9 @@ def factorise(
         singular, turn = singular[:n_terms], turn[:, :n_terms]
         root = np.sqrt(singular)
         texture = basis @ (turn * root).astype(np.float32)
-        angular = (flat @ turn / np.where(root > 0, root, 1)).reshape(sample.n_pairs, channels, n_terms)
+        angular = (flat @ turn / np.where(root > 0, root, 1)).reshape(
+            sample.n_pairs, channels, n_terms
+        )
         del basis, image
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
@@ -384,7 +386,7 @@ class _Passes:
                 parts.append(values @ basis)
                 for some in blocks(self.texels, _TEXELS):
                     sum_[some] += values[:, some].T @ parts[-1]
-                squares += _squares(values)
+                squares += sum_of_squares(values)
             return np.concatenate(parts), sum_, squares
 
         for group, (part, sum_, squares) in self._groups(work, chosen):
@@ -403,15 +405,10 @@ class _Passes:
                 values = self.rows(self.sample, pairs)
                 weights = np.asarray(angular[pairs], np.float32)
                 values -= weights.reshape(-1, len(texture)) @ texture
-                total += _squares(values)
+                total += sum_of_squares(values)
             return total
 
         return sum(part for _, part in self._groups(work))
-
-
-def _squares(values):
-    """Sum of squares: rows in single precision, their sum in double."""
-    return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
 def planar_pictures(sample, pairs, lines=slice(None)):

@@ -185,6 +185,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     if not mask.any():
         raise InputError("the sample has no valid texel.")
     white = white_level(sample)[0]
+    over_white = np.float32(min(1 / white, float(np.finfo(np.float32).max)))
     table = encode_table()
     pictures = model_pictures(model, sample, interpolation)
     sums = np.empty((sample.n_pairs, N_SUMS))
@@ -194,9 +195,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
         reference = np.ascontiguousarray(sample.pictures(pairs)).reshape(-1, texels, 3)
         other = np.ascontiguousarray(pictures(pairs)).reshape(-1, texels, 3)
         lumas = np.empty((2, len(reference), texels), np.float32)
-        sum_pictures(
-            reference, other, mask.ravel(), np.float32(1 / white), table, sums[pairs], *lumas
-        )
+        sum_pictures(reference, other, mask.ravel(), over_white, table, sums[pairs], *lumas)
         if min(rows, cols) >= WINDOW:
             ssim_pictures(*lumas.reshape(2, -1, rows, cols), mask, ssim[pairs])
         return pairs.stop
