@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe import store
-from btfpipe.compression.model import Model, sum_of_squares
+from btfpipe.compression.model import Model, require_summable, sum_of_squares
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -461,8 +461,7 @@ class _Lines:
 
         def work(values, row, cols):
             square = sum_of_squares(values)
-            if not math.isfinite(square):
-                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+            require_summable(square)
             coefficients = self._fit(values)
             if self.kept is not None:
                 self.kept[row, cols.start] = coefficients

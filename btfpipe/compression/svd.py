@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model, sum_of_squares
+from btfpipe.compression.model import Model, require_summable, sum_of_squares
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
@@ -132,7 +132,7 @@ def compress_svd(
     Raises
     ------
     InputError
-        No terms, non-finite pictures, values beyond half precision, or too little memory.
+        No terms, non-finite pictures, values too large for sums in single precision, values beyond half precision, or too little memory.
     """
     texture, angular, facts = factorise(
         sample, n_terms, iterations=iterations, precision=precision, seed=seed, threads=threads,
@@ -214,8 +214,6 @@ def factorise(
         for iteration in range(most_passes):
             basis = _orthonormal(basis)
             weights, image, energy = passes.power(basis)
-            if not math.isfinite(energy):
-                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
             flat = weights.reshape(-1, width).astype(np.float64)
             values, turn = np.linalg.eigh(flat.T @ flat)
             values, turn = np.maximum(values[::-1], 0), turn[:, ::-1]
@@ -383,16 +381,18 @@ class _Passes:
             parts, sum_, squares = [], np.zeros_like(image), 0.0
             for pairs in steps:
                 values = self.rows(self.sample, pairs)
+                squares += sum_of_squares(values)
+                require_summable(squares)
                 parts.append(values @ basis)
                 for some in blocks(self.texels, _TEXELS):
                     sum_[some] += values[:, some].T @ parts[-1]
-                squares += sum_of_squares(values)
             return np.concatenate(parts), sum_, squares
 
         for group, (part, sum_, squares) in self._groups(work, chosen):
+            energy += squares
+            require_summable(energy)
             weights[group] = part.reshape(-1, self.channels, basis.shape[1])
             image += sum_
-            energy += squares
         return weights, image, energy
 
     def squared_error(self, texture, angular):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from btfpipe.compression import compress
+from btfpipe.errors import InputError
 from btfpipe.metrics.comparison import compare
 
 METHODS = {
@@ -46,3 +47,21 @@ def test_errors_are_true_at_any_scale(scaled_sample, method, factor):
     figures = compare(model, sample).overall()["linear"]
     assert figures["rmse"] == pytest.approx(rmse, rel=1e-6, abs=0)
     assert figures["relative_error"] == pytest.approx(np.sqrt(error / energy), rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1e37, 1e38])
+@pytest.mark.parametrize("method", METHODS)
+def test_values_too_large_for_their_sums_are_called_that(scaled_sample, method, factor):
+    with pytest.raises(InputError, match="too large for single precision"):
+        compress([scaled_sample(factor)], method, **METHODS[method])
+
+
+def test_a_model_that_leaves_single_precision_is_refused(scaled_sample):
+    with pytest.raises(InputError, match="what the model makes of them leaves single precision"):
+        compress([scaled_sample(1.5e38)], "factored", space="log_y_uv_over_y")
+    sample = scaled_sample(1.0)
+    model = compress([sample], "svd", precision="single")
+    model.texture_factors = model.texture_factors * np.float32(1e38)
+    model.angular_factors = model.angular_factors * np.float32(1e38)
+    with pytest.raises(InputError, match="of the model are not finite"):
+        compare(model, sample)
