@@ -27,6 +27,7 @@ LEAST_PICTURES = 8  # in a thread's hands, however large: products with fewer on
 _TEXELS = 1 << 14  # whose sums are added at a time; fixed
 _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
+_TRACE = 2.0**-40  # of noise to the RMS in the start, where rounding has 2^-46 and terms 2^-30
 _MOST_ITERATIONS = 8
 _GOOD_ENOUGH = 0.005  # share by which the error may exceed the least possible, by the estimate
 _PROCESS_BYTES = 104 << 20  # Python and its libraries, before any work
@@ -210,6 +211,12 @@ def factorise(
         for _ in range(_FIRST_PASSES):
             basis = _orthonormal(basis)
             basis = passes.power(basis, first)[1]
+        # where the start's pictures are black or span too little, columns are 0 or rounding, blind to what other
+        # pictures show; noise takes their place
+        noise = rng.standard_normal(basis.shape, np.float32)
+        noise *= np.float32(math.sqrt(sum_of_squares(basis) / basis.size) * _TRACE or 1)
+        basis += noise
+        del noise
         shift = 0.0
         for iteration in range(most_passes):
             basis = _orthonormal(basis)
