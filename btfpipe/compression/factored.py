@@ -10,7 +10,7 @@ from numba import njit
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.model import Model, measured_error
-from btfpipe.compression.svd import factorise, pictures_to_read, planar_pictures
+from btfpipe.compression.svd import factorise, left_out, pictures_to_read, planar_pictures
 from btfpipe.errors import InputError
 
 EPSILON = 1e-5  # added inside logarithms by the ``.btf`` formats
@@ -244,7 +244,7 @@ def compress_factored(
     -------
     FactoredModel
         Its ``about`` holds `n_terms`, `singular_values` and `excess` of each channel, and `rmse` and
-        `relative_error` as measured on the decoded linear values.
+        `relative_error` as measured on the decoded linear values; `warnings` (sentences).
 
     Raises
     ------
@@ -290,6 +290,11 @@ def compress_factored(
         "precision": precision,
         **{key: [f[key] for f in facts] for key in ("iterations", "excess", "singular_values")},
         **measured_error(model, sample, threads=threads, on_progress=report),
+        "warnings": [
+            f"channel {c}: {warning}"
+            for c, (n, fact) in enumerate(zip(terms, facts, strict=True), 1)
+            for warning in left_out(sample, n, fact["n_terms"], channels=1)
+        ],
     }
     return model
 

@@ -139,18 +139,26 @@ def compress_svd(
         sample, n_terms, iterations=iterations, precision=precision, seed=seed, threads=threads,
         memory=memory, on_progress=on_progress,
     )  # fmt: skip
-    texels, most = sample.shape[0] * sample.shape[1], _most_terms(sample)
+    warnings = left_out(sample, n_terms, facts["n_terms"])
+    if warnings:
+        facts["warnings"] = warnings
+    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+
+
+def left_out(sample, n_terms, have, channels=3):
+    """Warnings, a list of sentences, if `factorise` made fewer terms than were asked for."""
+    texels, most = sample.shape[0] * sample.shape[1], _most_terms(sample, channels)
+    warnings = []
     if n_terms > most:
-        facts.setdefault("warnings", []).append(
-            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
+        of = " of three channels" if channels == 3 else ""
+        warnings.append(
+            f"{texels} texels and {sample.n_pairs} pairs{of} have at most {most} terms:"
             f" {n_terms - most} terms left out"
         )
-    have = facts["n_terms"]
     if have < min(n_terms, most):
-        facts.setdefault("warnings", []).append(
-            f"the sample's rank is {have}: {min(n_terms, most) - have} terms left out"
-        )
-    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+        what = "sample" if channels == 3 else "channel"
+        warnings.append(f"the {what}'s rank is {have}: {min(n_terms, most) - have} terms left out")
+    return warnings
 
 
 def _most_terms(sample, channels=3):
