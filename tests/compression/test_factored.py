@@ -100,6 +100,17 @@ def test_terms_that_do_not_exist_are_named_for_each_channel(make_sample):
     assert compress_factored(sample, (2, 1, 1)).about["warnings"] == []
 
 
+@pytest.mark.parametrize("space", ["log_rgb", "log_y_uv", "log_y_slog_uv", "log_y_uv_over_y"])
+def test_values_below_zero_are_said_to_be_lost_in_logarithms(make_sample, space):
+    sample = make_sample()
+    sample.codes[3] = 0
+    assert compress_factored(sample, (2, 1, 1), space).about["warnings"] == []
+    sample.codes = sample.codes - np.float32(0.05)
+    (warning,) = compress_factored(sample, (2, 1, 1), space).about["warnings"]
+    assert warning.startswith("values go down to -0.05, and logarithms take those below 0 for 0")
+    assert compress_factored(sample, (2, 1, 1), "ycocg").about["warnings"] == []
+
+
 def test_threads_and_memory_never_show(make_sample, tmp_path):
     sample = make_sample(rows=24, cols=20)
     files = []
