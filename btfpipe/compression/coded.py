@@ -316,6 +316,9 @@ class _Packer:
     def fit(self, target, spare=0, threads=1):
         """The Model whose file is as large as `target` allows, with some bytes to spare."""
         largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
+        tiny = float(np.finfo(np.float32).tiny)
+        if largest < tiny:  # single precision has no step for these
+            largest = 0.0
         sizes = {}
 
         def attempt(step):
@@ -330,9 +333,9 @@ class _Packer:
                 f"{target} bytes are too few: tables and description alone take {sizes[coarse]}. Ask for a smaller"
                 " --ratio, or for more --target-bytes."
             )
-        finest = max(largest / _LARGEST, np.finfo(np.float32).tiny)
+        finest = max(largest / _LARGEST, tiny)
         fine = coarse
-        while fits and fine > finest:  # coarse steps are quick
+        while fits and largest > 0 and fine > finest:  # coarse steps are quick
             coarse, fine = fine, max(fine / 4, finest)
             fits, *found = attempt(fine)
             best = found if fits else best

@@ -27,6 +27,7 @@ _FAST, _SLOW = 4, 7
 _TOP = 1 << 24
 _HALF = 1 << 15
 _DENSEST = 15_200  # numbers a byte: the chance of a zero is 65,512 of 65,536 at most
+_LIMIT = 1 << 30  # of a number's magnitude: neighbours' sums index tables
 _HEADER = 8  # bytes: checksum and length of what follows
 
 
@@ -36,8 +37,15 @@ def encode_planes(planes):
     Returns
     -------
     (n,) uint8
+
+    Raises
+    ------
+    ValueError
+        If a number is too large.
     """
     planes = np.ascontiguousarray(planes, np.int32)
+    if planes.size and max(-int(planes.min()), int(planes.max())) >= _LIMIT:
+        raise ValueError(f"numbers of {planes.min()} to {planes.max()}; expected less than 2^30.")
     out = np.empty(planes.size // 4 + 1024, np.uint8)
     n = _encode(planes, out, *_models())
     while n > len(out):

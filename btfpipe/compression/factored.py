@@ -10,7 +10,7 @@ from numba import njit
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.model import Model, measured_error
-from btfpipe.compression.svd import factorise, pictures_to_read, planar_pictures
+from btfpipe.compression.svd import factorise, left_out, pictures_to_read, planar_pictures
 from btfpipe.errors import InputError
 
 EPSILON = 1e-5  # added inside logarithms by the ``.btf`` formats
@@ -244,7 +244,7 @@ def compress_factored(
     -------
     FactoredModel
         Its ``about`` holds `n_terms`, `singular_values` and `excess` of each channel, and `rmse` and
-        `relative_error` as measured on the decoded linear values.
+        `relative_error` as measured on the decoded linear values; `warnings` (sentences).
 
     Raises
     ------
@@ -261,6 +261,7 @@ def compress_factored(
     total = sum(pictures_to_read(sample, n, 1, iterations, False) for n in terms) + sample.n_pairs
     into = _into(space)
     done, angular, texture, facts = 0, [], [], []
+    least = []
 
     def report(read, _):
         if on_progress is not None:
@@ -272,7 +273,7 @@ def compress_factored(
             planar = planar_pictures(sample, pairs)
             values = planar.reshape(-1, 3, planar.shape[1])
             out = np.empty((len(values), values.shape[2]), np.float32)
-            _encode_channel(values, SPACES[space], into, np.float32(epsilon), c, out)
+            least.append(_encode_channel(values, SPACES[space], into, np.float32(epsilon), c, out))
             return out
 
         vectors, weights, found = factorise(
@@ -290,8 +291,23 @@ def compress_factored(
         "precision": precision,
         **{key: [f[key] for f in facts] for key in ("iterations", "excess", "singular_values")},
         **measured_error(model, sample, threads=threads, on_progress=report),
+        "warnings": _negative(min(least), epsilon)
+        + [
+            f"channel {c}: {warning}"
+            for c, (n, fact) in enumerate(zip(terms, facts, strict=True), 1)
+            for warning in left_out(sample, n, fact["n_terms"], channels=1)
+        ],
     }
     return model
+
+
+def _negative(least, epsilon):
+    """A warning, in a list, if logarithms were asked of values further below 0 than what is added to them."""
+    if least >= -epsilon:
+        return []
+    return [
+        f"values go down to {least:.3g}, and logarithms take those below 0 for 0; choose --space linear, or another method"
+    ]
 
 
 def _into(space):
@@ -378,13 +394,18 @@ def _decode_all(a, b, c, space, matrix, mean, epsilon, log_range, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _encode_channel(values, space, into, epsilon, channel, out):
-    """Fill ``out`` (pairs, texels) with one channel of linear pictures (pairs, 3, texels)."""
+    """Fill ``out`` (pairs, texels) with one channel of linear pictures (pairs, 3, texels).
+
+    Returns the least value of which a logarithm was taken as of 0, or 0.
+    """
     zero = np.float32(0)
+    least = zero
     for p in range(values.shape[0]):
         for t in range(values.shape[2]):
             r, g, b = values[p, 0, t], values[p, 1, t], values[p, 2, t]
             x = into[channel, 0] * r + into[channel, 1] * g + into[channel, 2] * b
             if space == LOG_RGB or (channel == 0 and space >= LOG_Y_UV):
+                least = min(least, x)
                 x = np.log(max(x, zero) + epsilon)  # NaN stays: the comparison is false
             elif space == LOG_Y_UV_OVER_Y:
                 y = max(into[0, 0] * r + into[0, 1] * g + into[0, 2] * b, zero) + epsilon
@@ -403,3 +424,4 @@ def _encode_channel(values, space, into, epsilon, channel, out):
                 else:
                     x = np.float32(200.0 * (fy - _lab(x / _Z0)))
             out[p, t] = x
+    return least

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe import store
-from btfpipe.compression.model import Model
+from btfpipe.compression.model import Model, require_summable, sum_of_squares
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -460,9 +460,8 @@ class _Lines:
         energy = 0.0
 
         def work(values, row, cols):
-            square = _squares(values)
-            if not math.isfinite(square):
-                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+            square = sum_of_squares(values)
+            require_summable(square)
             coefficients = self._fit(values)
             if self.kept is not None:
                 self.kept[row, cols.start] = coefficients
@@ -490,15 +489,9 @@ class _Lines:
             _quantise(coefficients.reshape(*self.terms, -1, 3), minimum, step, codes[row, cols])
             by_light = np.matmul(lights, coefficients)
             values -= np.matmul(views, by_light.reshape(self.terms[0], -1)).reshape(values.shape)
-            return _squares(values)
+            return sum_of_squares(values)
 
         return codes, sum(self._blocks(work))
-
-
-def _squares(values):
-    """Sum of squares: rows in single precision, their sum in double."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
 @njit(cache=True, nogil=True)

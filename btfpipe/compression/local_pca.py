@@ -276,16 +276,17 @@ def compress_local_pca(
     passes = Passes(samples, labels, clusters, precision, planned, progress)
     with single_threaded_blas():
         frames = passes.frames(points, directions)
+        dimensions = points.shape[1]
         del points, directions
         frames = passes.improve(frames, components)
         bases, scales, coordinates = passes.project(frames, components)
     most = max(frame.shape[1] for frame in frames) - 1
     warnings = []
     if most < components:
-        warnings.append(
-            f"the clusters have at most {most} terms beside their mean: {components - most} of the"
-            f" {components} components left out"
-        )
+        what = f"the clusters have at most {most} terms beside their mean"
+        if most == dimensions >= REDUCED_TERMS:
+            what = f"clusters are found in the texels' first {most} dimensions and get no more terms beside their mean"
+        warnings.append(f"{what}: {components - most} of the {components} components left out")
         bases, coordinates = bases[..., : 1 + most].copy(), coordinates[:, :most].copy()
     materials = [
         {

@@ -14,6 +14,7 @@ from btfpipe.sample.sample import check_index
 
 _TABLES = ("light_directions", "view_directions", "light_index", "view_index")
 _BLOCK_BYTES = 4 << 20  # linear pictures compared at a time
+MOST_ENERGY = 1e38  # sum of squares that a method adds up in single precision
 _LEAST_PICTURES = 8  # however large: what a Model does once for several is then little
 
 
@@ -121,12 +122,21 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
     -------
     dict
         ``rmse``, and ``relative_error``: RMS of the error over RMS of the values.
+
+    Raises
+    ------
+    InputError
+        If values of the Sample, or of the Model, are not finite.
     """
     texels = sample.shape[0] * sample.shape[1]
 
     def work(pairs):
-        pictures = (appearance.pictures(pairs) for appearance in (sample, model))
-        return pairs.stop, *_squares(*(np.asarray(p, np.float32).reshape(-1) for p in pictures))
+        with np.errstate(over="ignore", invalid="ignore"):  # shows in the sums
+            pictures = [
+                np.asarray(appearance.pictures(pairs), np.float32).reshape(-1)
+                for appearance in (sample, model)
+            ]
+        return pairs.stop, *_squares(*pictures)
 
     total, energy = 0.0, 0.0
     with single_threaded_blas():
@@ -136,6 +146,12 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
             energy += square
             if on_progress is not None:
                 on_progress(done, sample.n_pairs)
+    require_summable(energy, math.inf)
+    if not math.isfinite(total):
+        raise InputError(
+            "the sample's values are too large: what the model makes of them leaves single precision. Scale them down"
+            " (`btfpipe ingest --white`)."
+        )
     return {
         "rmse": math.sqrt(total / (3 * texels * sample.n_pairs)),
         "relative_error": math.sqrt(total / energy) if energy > 0 else 0.0,
@@ -158,7 +174,49 @@ def _squares(reference, values):
     squared = 0.0
     square = 0.0
     for i in range(len(reference)):
-        error = np.float64(reference[i] - values[i])
+        value = np.float64(reference[i])
+        error = value - np.float64(values[i])
         squared += error * error
-        square += np.float64(reference[i]) * np.float64(reference[i])
+        square += value * value
     return squared, square
+
+
+def require_summable(energy, most=MOST_ENERGY):
+    """Refuse a Sample by what its squares add up to so far, by `sum_of_squares`.
+
+    No sum of products of its values is larger: checked before they are made, none of them overflows.
+
+    Parameters
+    ----------
+    energy : float
+    most : float
+        What the method stands.
+
+    Raises
+    ------
+    InputError
+        If values are not finite, or too large.
+    """
+    if not math.isfinite(energy):
+        raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
+    if energy > most:
+        raise InputError(
+            f"the sample's values are too large for single precision: sums over them reach {energy:.1e}, expected at"
+            f" most {most:.0e}. Scale them down (`btfpipe ingest --white`)."
+        )
+
+
+def sum_of_squares(values):
+    """Sum of squares of a contiguous array, in double precision.
+
+    Squares of single precision neither overflow there nor vanish: the sum is finite if the values are, and 0 only if they are.
+    """
+    return _sum_of_squares(values.reshape(-1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _sum_of_squares(values):
+    total = 0.0
+    for i in range(len(values)):
+        total += np.float64(values[i]) * np.float64(values[i])
+    return total

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model
+from btfpipe.compression.model import Model, require_summable, sum_of_squares
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
@@ -27,6 +27,7 @@ LEAST_PICTURES = 8  # in a thread's hands, however large: products with fewer on
 _TEXELS = 1 << 14  # whose sums are added at a time; fixed
 _FIRST_SHARE = 8  # one in so many pictures for the start
 _FIRST_PASSES = 3
+_TRACE = 2.0**-40  # of noise to the RMS in the start, where rounding has 2^-46 and terms 2^-30
 _MOST_ITERATIONS = 8
 _GOOD_ENOUGH = 0.005  # share by which the error may exceed the least possible, by the estimate
 _PROCESS_BYTES = 104 << 20  # Python and its libraries, before any work
@@ -132,24 +133,32 @@ def compress_svd(
     Raises
     ------
     InputError
-        No terms, non-finite pictures, values beyond half precision, or too little memory.
+        No terms, non-finite pictures, values too large for sums in single precision, values beyond half precision, or too little memory.
     """
     texture, angular, facts = factorise(
         sample, n_terms, iterations=iterations, precision=precision, seed=seed, threads=threads,
         memory=memory, on_progress=on_progress,
     )  # fmt: skip
-    texels, most = sample.shape[0] * sample.shape[1], _most_terms(sample)
+    warnings = left_out(sample, n_terms, facts["n_terms"])
+    if warnings:
+        facts["warnings"] = warnings
+    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+
+
+def left_out(sample, n_terms, have, channels=3):
+    """Warnings, a list of sentences, if `factorise` made fewer terms than were asked for."""
+    texels, most = sample.shape[0] * sample.shape[1], _most_terms(sample, channels)
+    warnings = []
     if n_terms > most:
-        facts.setdefault("warnings", []).append(
-            f"{texels} texels and {sample.n_pairs} pairs of three channels have at most {most} terms:"
+        of = " of three channels" if channels == 3 else ""
+        warnings.append(
+            f"{texels} texels and {sample.n_pairs} pairs{of} have at most {most} terms:"
             f" {n_terms - most} terms left out"
         )
-    have = facts["n_terms"]
     if have < min(n_terms, most):
-        facts.setdefault("warnings", []).append(
-            f"the sample's rank is {have}: {min(n_terms, most) - have} terms left out"
-        )
-    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+        what = "sample" if channels == 3 else "channel"
+        warnings.append(f"the {what}'s rank is {have}: {min(n_terms, most) - have} terms left out")
+    return warnings
 
 
 def _most_terms(sample, channels=3):
@@ -210,12 +219,16 @@ def factorise(
         for _ in range(_FIRST_PASSES):
             basis = _orthonormal(basis)
             basis = passes.power(basis, first)[1]
+        # where the start's pictures are black or span too little, columns are 0 or rounding, blind to what other
+        # pictures show; noise takes their place
+        noise = rng.standard_normal(basis.shape, np.float32)
+        noise *= np.float32(math.sqrt(sum_of_squares(basis) / basis.size) * _TRACE or 1)
+        basis += noise
+        del noise
         shift = 0.0
         for iteration in range(most_passes):
             basis = _orthonormal(basis)
             weights, image, energy = passes.power(basis)
-            if not math.isfinite(energy):
-                raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
             flat = weights.reshape(-1, width).astype(np.float64)
             values, turn = np.linalg.eigh(flat.T @ flat)
             values, turn = np.maximum(values[::-1], 0), turn[:, ::-1]
@@ -229,9 +242,11 @@ def factorise(
         singular = np.sqrt(values[:n_terms])
         n_terms = max(1, int((singular > 1e-6 * singular[0]).sum()))
         singular, turn = singular[:n_terms], turn[:, :n_terms]
-        root = np.sqrt(np.maximum(singular, np.finfo(np.float32).tiny))
+        root = np.sqrt(singular)
         texture = basis @ (turn * root).astype(np.float32)
-        angular = (flat @ turn / root).reshape(sample.n_pairs, channels, n_terms)
+        angular = (flat @ turn / np.where(root > 0, root, 1)).reshape(
+            sample.n_pairs, channels, n_terms
+        )
         del basis, image
         dtype = np.float16 if precision == "half" else np.float32
         _require_range(dtype, texture, angular)
@@ -381,16 +396,18 @@ class _Passes:
             parts, sum_, squares = [], np.zeros_like(image), 0.0
             for pairs in steps:
                 values = self.rows(self.sample, pairs)
+                squares += sum_of_squares(values)
+                require_summable(squares)
                 parts.append(values @ basis)
                 for some in blocks(self.texels, _TEXELS):
                     sum_[some] += values[:, some].T @ parts[-1]
-                squares += _squares(values)
             return np.concatenate(parts), sum_, squares
 
         for group, (part, sum_, squares) in self._groups(work, chosen):
+            energy += squares
+            require_summable(energy)
             weights[group] = part.reshape(-1, self.channels, basis.shape[1])
             image += sum_
-            energy += squares
         return weights, image, energy
 
     def squared_error(self, texture, angular):
@@ -403,15 +420,10 @@ class _Passes:
                 values = self.rows(self.sample, pairs)
                 weights = np.asarray(angular[pairs], np.float32)
                 values -= weights.reshape(-1, len(texture)) @ texture
-                total += _squares(values)
+                total += sum_of_squares(values)
             return total
 
         return sum(part for _, part in self._groups(work))
-
-
-def _squares(values):
-    """Sum of squares: rows in single precision, their sum in double."""
-    return float(np.vecdot(values, values).sum(dtype=np.float64))
 
 
 def planar_pictures(sample, pairs, lines=slice(None)):

@@ -11,7 +11,14 @@ import numpy as np
 from numba import njit
 
 from btfpipe import store
-from btfpipe.compression.model import Model, comparison_bytes, measured_error
+from btfpipe.compression.model import (
+    MOST_ENERGY,
+    Model,
+    comparison_bytes,
+    measured_error,
+    require_summable,
+    sum_of_squares,
+)
 from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -270,15 +277,12 @@ def _view_terms(strips, lights, shape, terms):
     textures = np.empty((1 + terms, 3, *shape), np.float32)
     gram, energy = np.zeros((lights, lights)), 0.0
     for lines, values in strips():
-        mean = values.mean(axis=0, dtype=np.float64)
-        energy += lights * float(np.square(mean).sum())
-        if not math.isfinite(energy):
-            raise InputError("the sample holds non-finite values; `btfpipe info` counts them.")
-        textures[0, :, lines] = mean
+        energy += sum_of_squares(values)
+        require_summable(energy, MOST_ENERGY**2)  # no squares but in double precision
+        textures[0, :, lines] = values.mean(axis=0, dtype=np.float64)
         values -= textures[0, :, lines]
         columns = values.reshape(lights, -1).astype(np.float64)
         gram += columns @ columns.T
-    energy += float(np.trace(gram))
     eigenvalues, vectors = np.linalg.eigh(gram)
     eigenvalues, vectors = eigenvalues[::-1][:terms], vectors[:, ::-1][:, :terms]
     rank = int((eigenvalues > _NOISE**2 * energy).sum())

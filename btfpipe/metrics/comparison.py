@@ -185,18 +185,18 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     if not mask.any():
         raise InputError("the sample has no valid texel.")
     white = white_level(sample)[0]
+    over_white = np.float32(min(1 / white, float(np.finfo(np.float32).max)))
     table = encode_table()
     pictures = model_pictures(model, sample, interpolation)
     sums = np.empty((sample.n_pairs, N_SUMS))
     ssim = np.full(sample.n_pairs, np.nan)
 
     def work(pairs):
-        reference = np.ascontiguousarray(sample.pictures(pairs)).reshape(-1, texels, 3)
-        other = np.ascontiguousarray(pictures(pairs)).reshape(-1, texels, 3)
+        with np.errstate(over="ignore", invalid="ignore"):  # shows in the sums
+            reference = np.ascontiguousarray(sample.pictures(pairs)).reshape(-1, texels, 3)
+            other = np.ascontiguousarray(pictures(pairs)).reshape(-1, texels, 3)
         lumas = np.empty((2, len(reference), texels), np.float32)
-        sum_pictures(
-            reference, other, mask.ravel(), np.float32(1 / white), table, sums[pairs], *lumas
-        )
+        sum_pictures(reference, other, mask.ravel(), over_white, table, sums[pairs], *lumas)
         if min(rows, cols) >= WINDOW:
             ssim_pictures(*lumas.reshape(2, -1, rows, cols), mask, ssim[pairs])
         return pairs.stop
@@ -206,9 +206,15 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
         for done in ordered_map(work, blocks(sample.n_pairs, size), threads):
             if on_progress is not None:
                 on_progress(done, sample.n_pairs)
-    if not np.isfinite(sums).all():
-        bad = int((~np.isfinite(sums).all(axis=1)).sum())
-        raise InputError(
-            f"{bad} pictures hold non-finite values; `btfpipe info` says in which file."
-        )
+    for who, column in ((sample, 1), (model, 3)):  # sums of squares: finite if the values are
+        bad = np.count_nonzero(~np.isfinite(sums[:, column]))
+        if bad and hasattr(who, "codes"):
+            raise InputError(
+                f"{bad} pictures hold non-finite values; `btfpipe info` says in which file."
+            )
+        if bad:
+            raise InputError(
+                f"{bad} pictures of the model are not finite: what it makes of the sample's values leaves single"
+                " precision. Scale the sample down (`btfpipe ingest --white`)."
+            )
     return Comparison(sums, ssim, 3 * int(mask.sum()), white)

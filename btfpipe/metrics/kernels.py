@@ -75,10 +75,13 @@ def sum_pictures(reference, pictures, mask, over_white, table, sums, luma_refere
                 y_reference += weight * dr
                 y += weight * dp
                 if mask[t]:
-                    s0 += (p - r) * (p - r)
-                    s1 += r * r
-                    s2 += p * r
-                    s3 += p * p
+                    # squares of very large and very small values leave single precision
+                    r64 = np.float64(r)
+                    p64 = np.float64(p)
+                    s0 += (p64 - r64) * (p64 - r64)
+                    s1 += r64 * r64
+                    s2 += p64 * r64
+                    s3 += p64 * p64
                     s4 += (dp - dr) * (dp - dr)
             luma_reference[n, t] = y_reference
             luma[n, t] = y

@@ -203,6 +203,17 @@ def test_tiny_and_constant_samples_survive(level, tmp_path):
     np.testing.assert_array_equal(whole(open_appearance(tmp_path / "m.npz")), whole(model))
 
 
+@pytest.mark.parametrize("size", [8, 16, 20])
+def test_a_black_sample_becomes_a_black_model(make_sample, size, tmp_path):
+    directions = bonn81()[:25]
+    sample = make_sample(size, size, lights=directions, views=directions, dtype=np.uint8)
+    sample.codes = np.zeros_like(sample.codes)
+    model = compress_coded(sample)
+    model.save(tmp_path / "m.npz")
+    assert not whole(open_appearance(tmp_path / "m.npz")).any()
+    assert model.about["rmse"] == 0
+
+
 def test_a_tiny_textured_sample_keeps_its_texture(make_sample):
     sample = make_sample(8, 8, lights=bonn81()[:1], views=bonn81()[:1])
     assert compress_coded(sample).about["relative_error"] < 0.001

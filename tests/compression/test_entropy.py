@@ -47,6 +47,14 @@ def test_zeros_are_nearly_free():
     assert len(encode_planes(np.zeros((10, 100, 100), np.int32))) < 200
 
 
+@pytest.mark.parametrize("value", [1 << 30, -(1 << 31)])
+def test_numbers_beyond_thirty_bits_are_refused(value):
+    planes = np.zeros((1, 4, 4), np.int32)
+    planes[0, 2, 2] = value
+    with pytest.raises(ValueError, match="less than 2"):
+        encode_planes(planes)
+
+
 @pytest.mark.parametrize("keep", [0, 5, 9, 200, -1])
 def test_cut_off_bytes_are_refused(rng, keep):
     planes = rng.integers(-3, 4, (2, 30, 30)).astype(np.int32)

@@ -86,6 +86,31 @@ def test_relative_errors_of_dark_texels_are_what_logarithms_are_for(make_sample,
     assert relative(compress_factored(sample, (6, 6, 6), "rgb")) > 2 * logarithmic
 
 
+def test_terms_that_do_not_exist_are_named_for_each_channel(make_sample):
+    sample = make_sample(rows=4, cols=5)
+    model = compress_factored(sample, (100000, 1, 25), "rgb")
+    first, last = model.n_terms[0], model.n_terms[2]
+    pairs = sample.n_pairs
+    assert model.about["warnings"] == [
+        f"channel 1: 20 texels and {pairs} pairs have at most 20 terms: 99980 terms left out",
+        f"channel 1: the channel's rank is {first}: {20 - first} terms left out",
+        f"channel 3: 20 texels and {pairs} pairs have at most 20 terms: 5 terms left out",
+        f"channel 3: the channel's rank is {last}: {20 - last} terms left out",
+    ]
+    assert compress_factored(sample, (2, 1, 1)).about["warnings"] == []
+
+
+@pytest.mark.parametrize("space", ["log_rgb", "log_y_uv", "log_y_slog_uv", "log_y_uv_over_y"])
+def test_values_below_zero_are_said_to_be_lost_in_logarithms(make_sample, space):
+    sample = make_sample()
+    sample.codes[3] = 0
+    assert compress_factored(sample, (2, 1, 1), space).about["warnings"] == []
+    sample.codes = sample.codes - np.float32(0.05)
+    (warning,) = compress_factored(sample, (2, 1, 1), space).about["warnings"]
+    assert warning.startswith("values go down to -0.05, and logarithms take those below 0 for 0")
+    assert compress_factored(sample, (2, 1, 1), "ycocg").about["warnings"] == []
+
+
 def test_threads_and_memory_never_show(make_sample, tmp_path):
     sample = make_sample(rows=24, cols=20)
     files = []

@@ -332,6 +332,17 @@ def test_terms_beyond_the_rank_are_left_out_with_a_warning(patchy_sample):
     ]
 
 
+def test_terms_beyond_the_reduced_dimensions_are_not_blamed_on_the_clusters(make_sample, rng):
+    sample = make_sample(16, 16)
+    sample.codes = rng.random(sample.codes.shape, np.float32)
+    model = compress_local_pca(sample, clusters=1, components=200)
+    assert model.n_terms == 150
+    assert model.about["warnings"] == [
+        "clusters are found in the texels' first 150 dimensions and get no more terms beside their mean: 50 of the 200"
+        " components left out"
+    ]
+
+
 def test_a_black_sample_becomes_a_black_model(patchy_sample):
     sample = patchy_sample()
     sample.codes = np.zeros_like(sample.codes)

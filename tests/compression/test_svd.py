@@ -193,6 +193,29 @@ def test_a_black_sample_becomes_a_black_model(make_sample):
     assert model.about["rmse"] == 0
 
 
+@pytest.mark.parametrize("lit", [1, 2, 3])
+def test_a_sample_black_but_for_a_few_texels_keeps_them(make_sample, lit):
+    sample = make_sample()
+    sample.codes = np.zeros_like(sample.codes)
+    for k in range(lit):  # each in another picture, so that few of the start's pictures show one
+        sample.codes[10 + 40 * k, 5 + k, 7 * k, k] = 0.7 + 0.1 * k
+    for seed in range(3):
+        model = compress_svd(sample, 4, precision="single", seed=seed)
+        assert model.n_terms == lit
+        np.testing.assert_allclose(matrix(model), matrix(sample), atol=1e-6)
+
+
+def test_texels_that_are_black_in_the_start_are_not_lost(make_sample, rng):
+    sample = make_sample(24, 24, views=bonn81()[:19])
+    values = np.zeros_like(sample.codes)
+    values[:, :, :12] = rng.random((len(values), 1, 1, 1)) * rng.random((24, 12, 3))
+    values[200, :, 12:] = 5 * rng.random((24, 12, 3))
+    sample.codes = values
+    for seed in range(4):  # a fifth of the pictures for the start
+        model = compress_svd(sample, 20, precision="single", seed=seed)
+        assert model.about["relative_error"] < 1e-5
+
+
 def test_half_precision_holds_high_dynamic_range_that_its_values_would_leave(make_sample):
     sample = make_sample()
     sample.codes = sample.codes * np.float32(1e6)
