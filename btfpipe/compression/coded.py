@@ -202,6 +202,7 @@ def compress_coded(
     )  # fmt: skip
     with single_threaded_blas():
         packer = _Packer(factors)
+        packer.source.mask = sample.mask
         del factors
         model = packer.fit(target_bytes, spare, threads)
     model.about |= measured_error(

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model
+from btfpipe.compression.model import Model, measured_error
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
@@ -147,7 +147,10 @@ def compress_svd(
         facts.setdefault("warnings", []).append(
             f"the sample's rank is {have}: {min(n_terms, most) - have} terms left out"
         )
-    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+    model = SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+    if model.mask is not None:
+        model.about |= measured_error(model, sample, threads=threads)
+    return model
 
 
 def _most_terms(sample, channels=3):
