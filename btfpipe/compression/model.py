@@ -126,7 +126,14 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
     -------
     dict
         ``rmse``, and ``relative_error``: RMS of the error over RMS of the values.
+
+    Raises
+    ------
+    InputError
+        If no texel is valid.
     """
+    if sample.mask is not None and not sample.mask.any():
+        raise InputError("the sample has no valid texel.")
     texels = sample.shape[0] * sample.shape[1]
     valid = slice(None) if sample.mask is None else np.flatnonzero(sample.mask)
 
