@@ -108,7 +108,8 @@ def add_neighbour_lists(
 
     Levels of up to `exhaustive_texels` texels are searched exhaustively. On a larger one the candidates of a texel are the four
     children of each of the `seeds` nearest texels of its parent on the next coarser level (the paper's m = 100; there,
-    all texels count, or with a mask those that have such children, neighbourhoods being clamped at the border). Below the coarsest level a low-pass of its vectors serves as parent.
+    all texels count, or with a mask those that have such children, neighbourhoods being clamped at the border). Below the
+    coarsest level a low-pass of its vectors serves as parent.
 
     Parameters
     ----------
@@ -141,10 +142,8 @@ def add_neighbour_lists(
     below = [*levels[1:listed], *[None] * (len(levels) - listed + 1)]
     masked = not all(level.valid.all() for level in features.levels)
     usable = [usable_texels(levels[i], below[i], *sides, toroidal) for i in range(listed)]
-    seedable = [np.zeros(levels[0].shape, bool)]
-    for i, level in enumerate(
-        levels[1:]
-    ):  # without a mask all texels, else those with a child to list
+    seedable = [np.zeros(levels[0].shape, bool)]  # of a mask, what has a child to list
+    for i, level in enumerate(levels[1:]):
         children = seedable[i] | usable[i] if i < listed else seedable[i]
         seedable.append(_parents(children, level.shape) if masked else np.ones(level.shape, bool))
     parents = None

@@ -7,6 +7,7 @@ from btfpipe.analysis.features import Features
 from btfpipe.analysis.neighbours import add_neighbour_lists, neighbourhood_distances
 from btfpipe.analysis.pyramid import fill_invalid, halve, plain_features, valid_pyramid
 from btfpipe.analysis.textons import texton_features
+from btfpipe.compression.svd import compress_svd
 from btfpipe.errors import InputError
 from btfpipe.synthesis import CoordinateMap
 from btfpipe.synthesis.growth import grow_over_surface
@@ -118,6 +119,19 @@ def test_no_invalid_texel_is_laid_on_a_plane(texture, rng, toroidal, full, level
     assert may_be_laid(mask, toroidal, levels)[nearest(grown, mask.shape, toroidal)].all()
 
 
+def test_no_growth_starts_from_an_invalid_texel(texture, rng):
+    mask = ragged(rng)
+    features = plain_features(texture(mask), False, 1, mask=mask)
+    add_neighbour_lists(features, 6)
+    first = set()
+    for seed in range(12):  # one sweep: the first texel stays as it was drawn
+        grown = grow_over_plane(features, (8, 8), k=6, levels=1, sweeps=(1, 1), seed=seed)
+        row, col = nearest(grown, mask.shape, False)
+        assert may_be_laid(mask, False, 1)[row, col].all()
+        first.add((int(row[0]), int(col[0])))
+    assert len(first) > 8
+
+
 @pytest.mark.parametrize("toroidal", [False, True])
 @pytest.mark.parametrize("k", [1, 6])
 def test_no_invalid_texel_is_laid_on_a_surface(texture, rng, sphere_surface, toroidal, k):
@@ -199,6 +213,16 @@ def test_textons_are_those_of_valid_texels(half, tmp_path):
     for level in features.levels:  # every texton is some texel's, and the default is none's
         assert set(np.unique(level.labels[level.valid])) == set(range(len(level.vectors) - 1))
         assert (level.labels[~level.valid] == len(level.vectors) - 1).all()
+
+
+def test_textons_do_not_depend_on_what_a_model_shows_at_invalid_texels(half):
+    model = compress_svd(half, 6)
+    made = [texton_features(model, levels=2, n_textons=40, k=6)]
+    model.texture_factors[~half.mask] = np.nan
+    made.append(texton_features(model, levels=2, n_textons=40, k=6))
+    for a, b in zip(*(features.levels for features in made), strict=True):
+        np.testing.assert_array_equal(a.labels, b.labels)
+        np.testing.assert_array_equal(a.neighbours, b.neighbours)
 
 
 def test_the_command_line_lays_valid_texels_alone(btfpipe, half, tmp_path, sphere_surface):
