@@ -20,7 +20,7 @@ class FeatureLevel:
     labels : (rows, cols) int32
     vectors : (n + 1, d) float32
         Feature vectors, compared by Euclidean distance. The last one is the default, for places that
-        belong to nothing; no label names it.
+        belong to nothing: invalid texels have its label, n.
     gram : (n + 1, n + 1) float32, optional
         Dot products of the full vectors that `vectors` stands for (the paper's dot-product matrix), default included.
     neighbours : (rows, cols, k) int32, optional
@@ -36,6 +36,11 @@ class FeatureLevel:
     @property
     def shape(self):
         return self.labels.shape
+
+    @property
+    def valid(self):
+        """Which texels may be shown (rows, cols) bool."""
+        return np.asarray(self.labels) < len(self.vectors) - 1
 
 
 @dataclass
@@ -63,7 +68,7 @@ class Features:
             labels = reader.require(p + "labels", (None, None), "i")
             vectors = reader.require(p + "vectors", (None, None), "f")
             n = len(vectors)
-            if labels.size == 0 or labels.min() < 0 or labels.max() >= n - 1:
+            if labels.size == 0 or labels.min() < 0 or labels.max() > n - 1:
                 raise InputError(f"{path}: labels of level {i} do not fit its {n - 1} vectors.")
             level = FeatureLevel(labels, vectors)
             if p + "gram" in reader:

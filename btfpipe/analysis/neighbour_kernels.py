@@ -78,8 +78,8 @@ def all_pairs(windows, first, last, pairs):
 
 
 @njit(cache=True, nogil=True)
-def exhaustive_lists(windows, coarse_pairs, coarse_cols, bounds, first, last, out):
-    """Lists of the texels of rows first to last, out of all texels within `bounds` (top, bottom, left, right).
+def exhaustive_lists(windows, coarse_pairs, coarse_cols, named, bounds, first, last, out):
+    """Lists of the texels of rows first to last, out of those `named` (rows, cols), which lie within `bounds` (top, bottom, left, right).
 
     Of two rows of texels the distances of all pairs of columns are summed over the rows of the neighbourhood once; the sum over its
     columns runs along the diagonals.
@@ -104,7 +104,7 @@ def exhaustive_lists(windows, coarse_pairs, coarse_cols, bounds, first, last, ou
                     for e in range(cols):
                         line[e] += coarse[start + coarse_texel(e)]
                 for e in range(bounds[2], bounds[3]):
-                    if line[e] <= distances[c, k]:
+                    if line[e] <= distances[c, k] and named[s, e]:
                         if s * cols + e != r * cols + c:
                             _offer(line[e], np.int32(s * cols + e), distances[c], texels[c])
         for c in range(cols):
@@ -174,8 +174,8 @@ def pair_distances(fine, coarse, texels, others, out):
 
 
 @njit(cache=True, nogil=True)
-def seeded_lists(fine, coarse, parents, bounds, first, last, out):
-    """Lists of the texels of rows first to last, out of the children within `bounds` of their parents' seeds."""
+def seeded_lists(fine, coarse, parents, named, bounds, first, last, out):
+    """As `exhaustive_lists`, out of the children of their parents' seeds."""
     cols = fine.labels.shape[1] - fine.side + 1
     parent_cols = parents.shape[1]
     k = out.shape[2] - 1
@@ -194,7 +194,7 @@ def seeded_lists(fine, coarse, parents, bounds, first, last, out):
                     e = 2 * seed_col + child % 2
                     if s < bounds[0] or s >= bounds[1] or e < bounds[2] or e >= bounds[3]:
                         continue
-                    if s == r and e == c:
+                    if not named[s, e] or (s == r and e == c):
                         continue
                     if start < 0.0:  # the coarse part is the same for all children
                         start = _square_distance(

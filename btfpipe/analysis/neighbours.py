@@ -7,6 +7,10 @@ on the next coarser level (Tong et al. 2002, sections 5.1 and 5.2).
 A sample that is not toroidal ends at its border. Lists name only texels whose whole neighbourhood, on both levels,
 lies inside; only the first entry, the texel itself, may be one of the others. For a texel near the border the part of its
 neighbourhood that lies inside is compared.
+
+Invalid texels, those with the default label, are beyond the border too: lists name no texel whose neighbourhood holds one, and what
+of a neighbourhood is invalid is not compared (where vectors are compared one by one, as the mean of all). An invalid texel's list
+names itself alone.
 """
 
 import numpy as np
@@ -28,7 +32,13 @@ SEEDS = 100
 _ROWS = 4  # rows a task
 _TABLE_VECTORS = 1024  # plain features beyond this many are compared vector by vector: their table would leave the cache
 
-__all__ = ["add_neighbour_lists", "coarse_texel", "inside_range", "neighbourhood_distances"]
+__all__ = [
+    "add_neighbour_lists",
+    "coarse_texel",
+    "inside_range",
+    "neighbourhood_distances",
+    "usable_texels",
+]
 
 
 def inside_range(size, coarse_size, neighbourhood, coarse_neighbourhood, toroidal):
@@ -53,6 +63,43 @@ def inside_range(size, coarse_size, neighbourhood, coarse_neighbourhood, toroida
     return low, high
 
 
+def usable_texels(level, coarse, neighbourhood, coarse_neighbourhood, toroidal):
+    """Texels whose whole neighbourhood lies inside the sample and is valid, the only ones that are ever placed.
+
+    Parameters
+    ----------
+    level, coarse : FeatureLevel
+        `coarse` is the next coarser level, or None.
+    neighbourhood, coarse_neighbourhood : int
+    toroidal : bool
+
+    Returns
+    -------
+    (rows, cols) bool
+    """
+    inside = []
+    for size, coarse_size in zip(level.shape, coarse.shape if coarse else (0, 0), strict=True):
+        low, high = inside_range(size, coarse_size, neighbourhood, coarse_neighbourhood, toroidal)
+        inside.append((np.arange(size) >= low) & (np.arange(size) < high))
+    usable = np.outer(*inside) & _solid(level, neighbourhood, toroidal)
+    if coarse:
+        children = (
+            _solid(coarse, coarse_neighbourhood, toroidal).repeat(2, axis=0).repeat(2, axis=1)
+        )
+        usable &= children[: level.shape[0], : level.shape[1]]
+    return usable
+
+
+def _solid(level, side, toroidal):
+    """Texels whose square has no invalid texel, whatever lies beyond the border."""
+    valid = level.valid
+    if valid.all():
+        return valid
+    from scipy.ndimage import minimum_filter
+
+    return minimum_filter(valid, side, mode="wrap" if toroidal else "nearest")
+
+
 def add_neighbour_lists(
     features, k=20, neighbourhood=5, coarse_neighbourhood=3, threads=1, *,
     exhaustive_texels=EXHAUSTIVE_TEXELS, seeds=SEEDS,
@@ -61,7 +108,8 @@ def add_neighbour_lists(
 
     Levels of up to `exhaustive_texels` texels are searched exhaustively. On a larger one the candidates of a texel are the four
     children of each of the `seeds` nearest texels of its parent on the next coarser level (the paper's m = 100; there,
-    all texels count, neighbourhoods being clamped at the border). Below the coarsest level a low-pass of its vectors serves as parent.
+    all texels count, or with a mask those that have such children, neighbourhoods being clamped at the border). Below the
+    coarsest level a low-pass of its vectors serves as parent.
 
     Parameters
     ----------
@@ -84,27 +132,36 @@ def add_neighbour_lists(
     InputError
         If a level is smaller than the neighbourhood, or offers fewer than `k` texels.
     """
+    sides = (neighbourhood, coarse_neighbourhood)
     toroidal = features.toroidal
     levels = list(features.levels)
     check_pyramid(levels[0].shape, len(levels), neighbourhood, coarse_neighbourhood)
     listed = len(levels)
     while levels[-1].labels.size > exhaustive_texels:
         levels.append(_low_pass(levels[-1], toroidal))
+    below = [*levels[1:listed], *[None] * (len(levels) - listed + 1)]
+    masked = not all(level.valid.all() for level in features.levels)
+    usable = [usable_texels(levels[i], below[i], *sides, toroidal) for i in range(listed)]
+    seedable = [np.zeros(levels[0].shape, bool)]  # of a mask, what has a child to list
+    for i, level in enumerate(levels[1:]):
+        children = seedable[i] | usable[i] if i < listed else seedable[i]
+        seedable.append(_parents(children, level.shape) if masked else np.ones(level.shape, bool))
     parents = None
     for i in reversed(range(len(levels))):
-        level = levels[i]
-        coarse = levels[i + 1] if i + 1 < listed else None
-        sides = (neighbourhood, coarse_neighbourhood)
+        level, coarse = levels[i], below[i]
         if i < listed:
-            search = _Search(level, coarse, *sides, toroidal)
+            search = _Search(level, coarse, *sides, toroidal, usable[i])
             if len(search) < k:
+                where = "inside the sample and is valid" if masked else "inside the sample"
                 raise InputError(
-                    f"level {i} has {len(search)} texels whose neighbourhood lies inside the sample, fewer than"
+                    f"level {i} has {len(search)} texels whose neighbourhood lies {where}, fewer than"
                     f" k = {k}; lower k or the number of levels, or take a larger sample."
                 )
             level.neighbours = search.lists(k, parents, threads)
+            invalid = np.flatnonzero(~level.valid)
+            level.neighbours.reshape(-1, k)[invalid] = invalid[:, None]
         if i > 0 and levels[i - 1].labels.size > exhaustive_texels:
-            search = _Search(level, coarse, *sides, toroidal, clamped=True)
+            search = _Search(level, coarse, *sides, toroidal, seedable[i], clamped=True)
             parents = search.lists(min(seeds, len(search)), parents, threads)
     features.about |= {
         "neighbourhood": neighbourhood,
@@ -140,17 +197,12 @@ def neighbourhood_distances(features, level, texels, others):
 
 
 class _Search:
-    """A level and its coarser one, made ready for both searches."""
+    """A level and its coarser one, made ready for both searches; `named` (rows, cols) bool is what lists may name."""
 
-    def __init__(self, level, coarse, side, coarse_side, toroidal, clamped=False):
+    def __init__(self, level, coarse, side, coarse_side, toroidal, named=None, clamped=False):
         self.shape = level.shape
         coarse_shape = coarse.shape if coarse else (0, 0)
-        everywhere = toroidal or clamped
-        self.bounds = [
-            bound
-            for size, coarse_size in zip(self.shape, coarse_shape, strict=True)
-            for bound in inside_range(size, coarse_size, side, coarse_side, everywhere)
-        ]
+        self.named = named
         mode = "wrap" if toroidal else "edge" if clamped else "constant"
         self.fine = _windows(level, side, mode)
         self.coarse = _windows(coarse, coarse_side, mode) if coarse else _NOTHING
@@ -159,13 +211,12 @@ class _Search:
 
     def __len__(self):
         """How many texels lists may name."""
-        top, bottom, left, right = self.bounds
-        return max(0, bottom - top) * max(0, right - left)
+        return int(np.count_nonzero(self.named))
 
     def lists(self, k, parents, threads):
         """Lists (rows, cols, k), from the children of `parents` (rows / 2, cols / 2, seeds) if given."""
         out = np.empty((*self.shape, k), np.int32)
-        bounds = np.array(self.bounds)
+        named, bounds = self.named, np.array(bounding_box(self.named))
         if parents is None:
             fine, coarse = (
                 windows
@@ -177,13 +228,15 @@ class _Search:
 
             def search(rows):
                 exhaustive_lists(
-                    fine, pairs, self.coarse_shape[1], bounds, rows.start, rows.stop, out
+                    fine, pairs, self.coarse_shape[1], named, bounds, rows.start, rows.stop, out
                 )
         else:
             parents = np.ascontiguousarray(parents)
 
             def search(rows):
-                seeded_lists(self.fine, self.coarse, parents, bounds, rows.start, rows.stop, out)
+                seeded_lists(
+                    self.fine, self.coarse, parents, named, bounds, rows.start, rows.stop, out
+                )
 
         list(ordered_map(search, blocks(self.shape[0], _ROWS), threads))
         return out
@@ -200,6 +253,20 @@ class _Search:
 
         list(ordered_map(fill, blocks(rows, _ROWS), threads))
         return pairs
+
+
+def bounding_box(mask):
+    """Top, bottom, left and right (the second and last exclusive) of what is true; zeros if nothing is."""
+    found = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+    return [int(bound) for at in found for bound in ((at[0], at[-1] + 1) if len(at) else (0, 0))]
+
+
+def _parents(children, shape):
+    """Texels of a coarser level that have one of the given children."""
+    parents = np.zeros(shape, bool)
+    row, col = np.nonzero(children)
+    parents[row // 2, col // 2] = True
+    return parents
 
 
 def _low_pass(level, toroidal):

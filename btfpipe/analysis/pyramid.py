@@ -34,6 +34,58 @@ def halve(image, toroidal):
     return image
 
 
+def valid_pyramid(mask, levels, toroidal):
+    """Which texels are valid on each level of a pyramid: those that `halve` makes of valid texels alone.
+
+    Parameters
+    ----------
+    mask : (rows, cols) bool or None
+        Of the finest level; None if all are valid.
+    levels : int
+    toroidal : bool
+
+    Returns
+    -------
+    list of (rows, cols) bool, or of None
+
+    Raises
+    ------
+    InputError
+        If a level has none.
+    """
+    if mask is None:
+        return [None] * levels
+    finest = mask = np.asarray(mask, bool)
+    made = []
+    for level in range(levels):
+        if level:
+            mask = halve(mask.astype(np.float32), toroidal) == 1
+        if not mask.any():
+            if not level:
+                raise InputError("the sample has no valid texel.")
+            raise InputError(
+                f"the sample has no valid texel on level {level}: {int((~finest).sum())} of its {finest.size} are invalid."
+                " Take fewer levels, or crop it to a part that is valid."
+            )
+        made.append(mask)
+    return made
+
+
+def fill_invalid(image, mask, toroidal):
+    """An image (rows, cols, d) whose invalid texels repeat the nearest valid one, as pictures repeat their border."""
+    from scipy.ndimage import distance_transform_edt
+
+    pad = [(n + 1) // 2 if toroidal else 0 for n in mask.shape]
+    invalid = np.pad(~np.asarray(mask, bool), [(n, n) for n in pad], "wrap")
+    nearest = distance_transform_edt(invalid, return_distances=False, return_indices=True)
+    rows, cols = (slice(n, n + size) for n, size in zip(pad, mask.shape, strict=True))
+    row, col = (
+        (index[rows, cols] - n) % size
+        for index, n, size in zip(nearest, pad, mask.shape, strict=True)
+    )
+    return image[row, col]
+
+
 def check_pyramid(shape, levels, neighbourhood, coarse_neighbourhood, what="the sample"):
     """Refuse a sample that is too small, or of the wrong size, for its pyramid.
 
@@ -66,7 +118,7 @@ def check_pyramid(shape, levels, neighbourhood, coarse_neighbourhood, what="the 
 
 
 def plain_features(
-    image, toroidal=False, levels=3, neighbourhood=5, coarse_neighbourhood=3, **about
+    image, toroidal=False, levels=3, neighbourhood=5, coarse_neighbourhood=3, mask=None, **about
 ):
     """Features whose vectors are the texels of a feature image: no textons.
 
@@ -79,6 +131,8 @@ def plain_features(
         Levels of the pyramid, made by `halve`.
     neighbourhood, coarse_neighbourhood : int
         Sides that the synthesis will use; the sample is checked against them.
+    mask : (rows, cols) bool, optional
+        Valid texels; what the others hold does not matter. All by default.
     **about
         Further facts for ``Features.about``.
 
@@ -90,12 +144,15 @@ def plain_features(
     Raises
     ------
     InputError
-        If the image is not (rows, cols, d), holds NaN or infinity, is too small, or its values are so large that
-        squared distances of neighbourhoods overflow single precision.
+        If the image is not (rows, cols, d), holds NaN or infinity, is too small, has no valid texel on some level, or its
+        values are so large that squared distances of neighbourhoods overflow single precision.
     """
     image = np.asarray(image)
     if image.ndim != 3 or image.size == 0:
         raise InputError(f"feature image has shape {image.shape}; expected (rows, cols, features).")
+    valid = valid_pyramid(mask, levels, toroidal)
+    if mask is not None:
+        image = fill_invalid(image, mask, toroidal)
     require_finite(image, "feature image")
     _require_distances(image, neighbourhood**2 + coarse_neighbourhood**2)
     image = image.astype(np.float32)
@@ -104,7 +161,7 @@ def plain_features(
     for level in range(levels):
         if level:
             image = halve(image, toroidal)
-        made.append(plain_level(image))
+        made.append(plain_level(image, valid[level]))
     about |= {
         "toroidal": bool(toroidal),
         "neighbourhood": neighbourhood,
@@ -113,13 +170,17 @@ def plain_features(
     return Features(made, about)
 
 
-def plain_level(image):
-    """One FeatureLevel of a feature image (rows, cols, d): a vector a texel, the mean as default."""
+def plain_level(image, valid=None):
+    """One FeatureLevel of a feature image (rows, cols, d): a vector a texel, the mean as default and for invalid texels."""
     rows, cols, depth = image.shape
     vectors = image.reshape(-1, depth)
-    default = vectors.mean(axis=0, dtype=np.float64, keepdims=True)
+    kept = slice(None) if valid is None else valid.ravel()
+    default = vectors[kept].mean(axis=0, dtype=np.float64, keepdims=True)
+    labels = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols)
+    if valid is not None:
+        labels[~valid] = rows * cols
     return FeatureLevel(
-        np.arange(rows * cols, dtype=np.int32).reshape(rows, cols),
+        labels,
         np.concatenate([vectors, default]).astype(np.float32),
     )
 

@@ -11,6 +11,9 @@ One choice is not the paper's: on all levels but the coarsest, each filter is sc
 sample. The coarsest level lays out the large structure, and there filters keep their own strength; on the others the
 layout is given, and Gaussians, whose responses vary up to 30 times as much as those of the finest derivatives, would smear
 the detail: grown over a plane, a fifth of CORDUROY's texels repeated their neighbour's, now one in a hundred.
+
+Invalid texels repeat the nearest valid one before anything is filtered, as beyond the border; they take no part in the
+clustering, and have the default texton.
 """
 
 from dataclasses import dataclass
@@ -21,7 +24,13 @@ import numpy as np
 from btfpipe.analysis.features import FeatureLevel, Features
 from btfpipe.analysis.filters import N_FILTERS, base_sigma, filter_pictures, leung_malik
 from btfpipe.analysis.neighbours import add_neighbour_lists
-from btfpipe.analysis.pyramid import check_pyramid, halve, require_finite
+from btfpipe.analysis.pyramid import (
+    check_pyramid,
+    fill_invalid,
+    halve,
+    require_finite,
+    valid_pyramid,
+)
 from btfpipe.compression.svd import SvdModel, compress_svd
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, single_threaded_blas
@@ -63,16 +72,19 @@ def texton_features(
     -------
     Features
         Its ``about`` also holds, level by level, ``n_textons``, ``inertia`` (mean squared distance of a texel's full
-        vector from its texton, as a share of that from the mean vector) and ``dimensions`` of the vectors.
+        vector from its texton, as a share of that from the mean vector) and ``dimensions`` of the vectors; and, of a
+        sample with a mask, ``invalid_texels``.
 
     Raises
     ------
     InputError
-        If the sample is too small for its levels and neighbourhoods, holds NaN or infinity, or needs more memory.
+        If the sample is too small for its levels and neighbourhoods, or too little of it is valid, if it holds NaN or
+        infinity, or needs more memory.
     """
     report = on_progress or (lambda done, total: None)
     steps = 2 * levels + 3
     check_pyramid(appearance.shape, levels, neighbourhood, coarse_neighbourhood)
+    valid = valid_pyramid(appearance.mask, levels, appearance.toroidal)
     textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
     need = 4 * N_FILTERS * textures.size * 3 // 2
     if need > memory:
@@ -93,12 +105,14 @@ def texton_features(
             if level:
                 image = halve(image, appearance.toroidal)
             responses = appearance_vectors(image, appearance.toroidal, threads)
+            if valid[level] is not None:
+                responses = responses[valid[level].ravel()]
             if level < levels - 1:
                 equalise(responses)
             report(2 * level + 3, steps)
-            count = min(max(2, n_textons // 4**level), image.shape[0] * image.shape[1] // 2)
+            count = min(max(2, n_textons // 4**level), max(1, len(responses) // 2))
             textons = cluster(responses, count, seed)
-            made.append(texton_level(textons, image.shape[:2]))
+            made.append(texton_level(textons, image.shape[:2], valid[level]))
             facts.append((textons, made[-1].vectors.shape[1]))
             del responses
             report(2 * level + 4, steps)
@@ -112,6 +126,8 @@ def texton_features(
         "cluster_share": [t.share for t, _ in facts],
         "dimensions": [d for _, d in facts],
     }
+    if appearance.mask is not None:
+        about["invalid_texels"] = [int(np.count_nonzero(~mask)) for mask in valid]
     features = Features(made, about)
     add_neighbour_lists(features, k, neighbourhood, coarse_neighbourhood, threads)
     report(steps, steps)
@@ -119,13 +135,19 @@ def texton_features(
 
 
 def eigen_textures(appearance, *, seed=0, threads=1, memory=2 << 30):
-    """Eigen-textures (rows, cols, n) and angular factors (pairs, 3, n), both float32, of any Appearance."""
+    """Eigen-textures (rows, cols, n) and angular factors (pairs, 3, n), both float32, of any Appearance.
+
+    Invalid texels repeat the nearest valid one.
+    """
+    mask = appearance.mask
     if not isinstance(appearance, SvdModel):
         terms = min(_SVD_TERMS, appearance.shape[0] * appearance.shape[1], 3 * appearance.n_pairs)
         appearance = compress_svd(
             appearance, terms, precision="single", seed=seed, threads=threads, memory=memory
         )
     textures = np.asarray(appearance.texture_factors, np.float32)
+    if mask is not None:
+        textures = fill_invalid(textures, mask, appearance.toroidal)
     angular = np.asarray(appearance.angular_factors, np.float32)
     require_finite(textures, "the sample")
     if not np.isfinite(angular).all():
@@ -347,8 +369,10 @@ def _distances_to(vectors, centres, labels):
     return np.square(vectors - centres[labels]).sum(axis=1)
 
 
-def texton_level(textons, shape):
+def texton_level(textons, shape, valid=None):
     """FeatureLevel of a vocabulary: texton map, dot-product matrix and its Euclidean factor, default texton last.
+
+    `valid` (rows, cols) bool says which texels the vocabulary's labels are of; all by default.
 
     Dot products are taken from the default texton, the mean of all: weights of a combination of textons sum to
     1, so distances do not depend on the origin, and single precision loses least there.
@@ -362,8 +386,12 @@ def texton_level(textons, shape):
     left = values.sum() - np.cumsum(values)
     d = int(np.argmax(left <= _FACTOR_LOSS * values.sum())) + 1
     vectors = axes[:, :d] * np.sqrt(values[:d])
+    labels = textons.labels
+    if valid is not None:
+        labels = np.full(shape, len(textons.centres), np.int32)
+        labels[valid] = textons.labels
     return FeatureLevel(
-        textons.labels.reshape(shape),
+        labels.reshape(shape),
         (vectors - vectors[-1]).astype(np.float32),
         gram.astype(np.float32),
     )

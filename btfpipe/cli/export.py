@@ -65,8 +65,16 @@ def export(
     if format_ == "btf":  # factorised on the way
         options |= {"seed": seed, "memory": memory}
     appearance = open_appearance(source, material)
+    if appearance.n_invalid and not quiet:
+        rows, cols = appearance.shape
+        click.echo(
+            f"Warning: {appearance.n_invalid} of {rows * cols} texels are invalid, which {format_} has no way to say: they"
+            " are written as they are.",
+            err=True,
+        )
     with naming(source), progress("export: pictures", quiet) as report:
         facts = targets.write(
             out, format_, appearance, threads=threads, on_progress=report, **options
         )
-    return {"inputs": [source], "format": format_, **(facts or {})}
+    invalid = {"invalid_texels": appearance.n_invalid} if appearance.n_invalid else {}
+    return {"inputs": [source], "format": format_, **(facts or {}), **invalid}

@@ -203,6 +203,7 @@ def compress_coded(
     )  # fmt: skip
     with single_threaded_blas():
         packer = _Packer(SvdModel(texture.reshape(*sample.shape, -1), angular, roots, facts))
+        packer.source.mask = sample.mask
         del texture, angular
         model = packer.fit(target_bytes, spare, threads)
     model.about |= measured_error(

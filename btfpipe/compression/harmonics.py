@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe import store
-from btfpipe.compression.model import Model, require_summable, sum_of_squares
+from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -230,7 +230,10 @@ def compress_harmonics(
         "rmse": math.sqrt(squared_error / count),
         "relative_error": math.sqrt(squared_error / energy) if energy > 0 else 0.0,
     }
-    return HarmonicsModel(codes, minimum, maximum, sample, about)
+    model = HarmonicsModel(codes, minimum, maximum, sample, about)
+    if model.mask is not None:
+        model.about |= measured_error(model, sample, threads=threads)
+    return model
 
 
 def view_weights(views):

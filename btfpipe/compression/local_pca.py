@@ -59,13 +59,15 @@ class LocalPcaModel(Model):
         The material that is evaluated.
     scales : (clusters, pairs) float16, optional
         What bases in bytes are multiplied by.
+    masks : (texels of all materials,) bool, optional
+        Valid texels, as `labels`; all by default.
     """
 
     method = "local-pca"
 
     def __init__(
-        self, bases, coordinates, labels, materials, source, about=None, chosen=0, scales=None
-    ):
+        self, bases, coordinates, labels, materials, source, about=None, chosen=0, scales=None, masks=None
+    ):  # fmt: skip
         facts = {name: materials[chosen][name] for name in _FACTS}
         tables = {name: getattr(source, name) for name in _DIRECTIONS}
         super().__init__(materials[chosen]["shape"], SimpleNamespace(**facts, **tables), about)
@@ -74,6 +76,9 @@ class LocalPcaModel(Model):
         self.coordinates = coordinates
         self.labels = labels
         self.about |= {"materials": materials, "material": chosen}
+        self.masks = masks
+        if masks is not None:
+            self.mask = masks[self._range()].reshape(self.shape)
 
     @property
     def n_clusters(self):
@@ -110,13 +115,14 @@ class LocalPcaModel(Model):
             )
         return type(self)(
             self.bases, self.coordinates, self.labels, self.about["materials"], self, self.about,
-            int(index), self.scales,
+            int(index), self.scales, self.masks,
         )  # fmt: skip
 
     def arrays(self):
         """Of the whole database, whichever material is evaluated; so is `nbytes`."""
         arrays = {"bases": self.bases, "coordinates": self.coordinates, "labels": self.labels}
-        return arrays if self.scales is None else arrays | {"scales": self.scales}
+        optional = {"scales": self.scales, "mask": self.masks}
+        return arrays | {name: array for name, array in optional.items() if array is not None}
 
     @classmethod
     def from_arrays(cls, reader, source):
@@ -142,7 +148,8 @@ class LocalPcaModel(Model):
             raise InputError(
                 f"{reader.path}: labels reach {labels.max()}; expected less than {len(bases)} clusters."
             )
-        return cls(bases, coordinates, labels, materials, source, about, chosen, scales)
+        masks = reader.require("mask", labels.shape, "b") if "mask" in reader else None
+        return cls(bases, coordinates, labels, materials, source, about, chosen, scales, masks)
 
     def _range(self):
         """Slice of the material's texels."""
@@ -295,12 +302,19 @@ def compress_local_pca(
             "toroidal": bool(sample.toroidal),
             "texels_per_mm": sample.texels_per_mm,
             "absolute": bool(getattr(sample, "absolute", False)),
+            **({"invalid_texels": sample.n_invalid} if sample.n_invalid else {}),
             **({"resampled_from": resampled[name]} if name in resampled else {}),
         }
         for name, sample in zip(names, samples, strict=True)
     ]
     labels = labels.astype(np.min_scalar_type(clusters - 1))
-    model = LocalPcaModel(bases, coordinates, labels, materials, samples[0], scales=scales)
+    masks = None
+    if any(sample.n_invalid for sample in samples):
+        full = (np.ones(s.shape, bool) if s.mask is None else s.mask for s in samples)
+        masks = np.concatenate([mask.ravel() for mask in full])
+    model = LocalPcaModel(
+        bases, coordinates, labels, materials, samples[0], scales=scales, masks=masks
+    )
     for index, (sample, facts) in enumerate(zip(samples, materials, strict=True)):
         facts |= measured_error(
             model.material(index), sample, threads=threads, on_progress=progress.part(pairs)
@@ -320,7 +334,7 @@ def _overall(materials):
     """RMSE and relative error over the values of all materials, from those of each."""
     squared, energy, count = 0.0, 0.0, 0
     for facts in materials:
-        texels = math.prod(facts["shape"])
+        texels = math.prod(facts["shape"]) - facts.get("invalid_texels", 0)
         squared += facts["rmse"] ** 2 * texels
         if facts["relative_error"] > 0:
             energy += (facts["rmse"] / facts["relative_error"]) ** 2 * texels

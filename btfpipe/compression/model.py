@@ -29,7 +29,7 @@ class Model(Appearance):
     shape : (int, int)
         Rows and cols of texels.
     source : Appearance
-        Gives directions, index tables, toroidal, texels_per_mm, absolute.
+        Gives directions, index tables, toroidal, texels_per_mm, absolute, mask.
     about : dict, optional
         Facts for the file.
     """
@@ -41,6 +41,7 @@ class Model(Appearance):
         for name in (*_TABLES, "toroidal", "texels_per_mm"):
             setattr(self, name, getattr(source, name))
         self.absolute = getattr(source, "absolute", False)
+        self.mask = getattr(source, "mask", None)
         self.about = dict(about or {})
 
     def arrays(self):
@@ -55,7 +56,13 @@ class Model(Appearance):
     @classmethod
     def from_reader(cls, reader):
         """Map the Model from its file."""
-        return cls.from_arrays(reader, read_tables(reader))
+        model = cls.from_arrays(reader, read_tables(reader))
+        mask = model.mask
+        if mask is not None and (mask.shape != model.shape or mask.dtype != bool):
+            raise InputError(
+                f"{reader.path}: mask is {mask.dtype} of shape {mask.shape}; expected bool of {model.shape}."
+            )
+        return model
 
     def save(self, path):
         """Write the Model."""
@@ -76,8 +83,9 @@ class Model(Appearance):
 
 
 def tables(source):
-    """Names of the tables that a Model's file holds: of a product, whose pairs follow a rule, directions alone."""
-    return _TABLES[:2] if source.is_product else _TABLES
+    """Names of the tables that a Model's file holds: of a product, whose pairs follow a rule, directions alone; and its mask."""
+    names = _TABLES[:2] if source.is_product else _TABLES
+    return names if getattr(source, "mask", None) is None else (*names, "mask")
 
 
 def read_tables(reader):
@@ -103,11 +111,12 @@ def read_tables(reader):
         toroidal=about["toroidal"],
         texels_per_mm=about["texels_per_mm"],
         absolute=about["absolute"],
+        mask=reader["mask"] if "mask" in reader else None,
     )
 
 
 def measured_error(model, sample, *, threads=1, on_progress=None):
-    """RMSE and relative error of a Model, over all linear values of its Sample.
+    """RMSE and relative error of a Model, over all linear values of its Sample's valid texels.
 
     Parameters
     ----------
@@ -126,17 +135,20 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
     Raises
     ------
     InputError
-        If values of the Sample, or of the Model, are not finite.
+        If no texel is valid; if values of the Sample, or of the Model, are not finite.
     """
+    if sample.mask is not None and not sample.mask.any():
+        raise InputError("the sample has no valid texel.")
     texels = sample.shape[0] * sample.shape[1]
+    valid = slice(None) if sample.mask is None else np.flatnonzero(sample.mask)
+
+    def values(appearance, pairs):
+        pictures = np.asarray(appearance.pictures(pairs), np.float32)
+        return pictures.reshape(-1, texels, 3)[:, valid].reshape(-1)
 
     def work(pairs):
         with np.errstate(over="ignore", invalid="ignore"):  # shows in the sums
-            pictures = [
-                np.asarray(appearance.pictures(pairs), np.float32).reshape(-1)
-                for appearance in (sample, model)
-            ]
-        return pairs.stop, *_squares(*pictures)
+            return pairs.stop, *_squares(values(sample, pairs), values(model, pairs))
 
     total, energy = 0.0, 0.0
     with single_threaded_blas():
@@ -153,7 +165,7 @@ def measured_error(model, sample, *, threads=1, on_progress=None):
             " (`btfpipe ingest --white`)."
         )
     return {
-        "rmse": math.sqrt(total / (3 * texels * sample.n_pairs)),
+        "rmse": math.sqrt(total / (3 * (texels - sample.n_invalid) * sample.n_pairs)),
         "relative_error": math.sqrt(total / energy) if energy > 0 else 0.0,
     }
 

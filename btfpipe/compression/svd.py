@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
-from btfpipe.compression.model import Model, require_summable, sum_of_squares
+from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.transfer import decode_table
@@ -142,7 +142,10 @@ def compress_svd(
     warnings = left_out(sample, n_terms, facts["n_terms"])
     if warnings:
         facts["warnings"] = warnings
-    return SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+    model = SvdModel(texture.reshape(*sample.shape, -1), angular, sample, facts)
+    if model.mask is not None:
+        model.about |= measured_error(model, sample, threads=threads)
+    return model
 
 
 def left_out(sample, n_terms, have, channels=3):

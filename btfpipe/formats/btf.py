@@ -22,7 +22,8 @@ What no measured file has confirmed yet:
   light's cosine as a factor. `cosine` overrides that.
 - Lab is taken under D50 to linear Rec. 709, as the other colour models are linear; the makers' library gives display values
   there. The RGB scale factors of the header are reported, not applied.
-- The mask of a BDI is taken with columns fastest, as the makers' library writes it (it reads it the other way).
+- The mask of a BDI is taken with columns fastest, as the makers' library writes it (it reads it the other way). Texels where it
+  is 0 are invalid, whether values of them are stored or not; a mask that is 0 everywhere beside all texels says nothing.
 """
 
 from btfpipe.errors import InputError

@@ -125,8 +125,6 @@ def read_bdi(file, header, memory):
     stored = np.arange(len(header.mask))
     if header.packing == 2:
         stored = np.flatnonzero(header.mask)
-        if len(stored) < len(header.mask):
-            header.facts["missing_texels"] = len(header.mask) - len(stored)
     n_values = 3 * header.n_pairs
     full = header.cols * header.scan_lines
     chunks = []
@@ -149,7 +147,13 @@ def read_bdi(file, header, memory):
         picture = windows.picture(pair).reshape(header.rows, header.cols, 3)
         return picture if factor is None else picture.astype(np.float32) * factor[pair]
 
-    return _measurement(file, header, read)
+    measurement = _measurement(file, header, read)
+    valid = header.mask.reshape(header.rows, header.cols) != 0
+    if (
+        header.packing == 2 or valid.any()
+    ):  # beside all texels, an empty mask is one never filled in
+        measurement.mask = None if valid.all() else valid
+    return measurement
 
 
 class _Windows:

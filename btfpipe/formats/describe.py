@@ -129,11 +129,17 @@ def _describe_measurement(measurement, threads, report):
         "views": describe_directions(views),
         "lights": describe_directions(lights),
         "product": measurement.n_pairs == len(views) * len(lights),
+        **_invalid(measurement),
         "clipped_values": clipped,
         "clipped_pictures": clipped_pictures,
         "facts": {key: _cut(value) for key, value in measurement.facts.items()},
         "problems": [*problems, *measurement.facts.get("warnings", [])],
     }
+
+
+def _invalid(measurement):
+    mask = measurement.mask
+    return {} if mask is None else {"invalid_texels": int(mask.size - mask.sum())}
 
 
 def describe_picture(picture, path):

@@ -28,7 +28,16 @@ class Appearance:
     toroidal : bool
         Whether the patch continues at the opposite border.
     texels_per_mm : float or None
+    mask : (rows, cols) bool or None
+        Valid texels; None if all are. What is measured over values leaves the others out, and synthesis never places them.
     """
+
+    mask = None
+
+    @property
+    def n_invalid(self):
+        """Number of texels that the mask leaves out."""
+        return 0 if self.mask is None else int(np.size(self.mask) - np.count_nonzero(self.mask))
 
     @property
     def n_pairs(self):

@@ -26,7 +26,7 @@ def describe_container(reader, report=lambda done, total: None):
     -------
     dict
         ``kind``, ``digest``, ``about``, ``arrays`` (name to shape, type and number of values that are not finite), for
-        a sample also ``sample``, and ``problems``: a list of sentences.
+        a sample also ``sample``, where there is a mask ``invalid_texels``, and ``problems``: a list of sentences.
     """
     problems, arrays = [], {}
     for name in reader.names():
@@ -42,6 +42,8 @@ def describe_container(reader, report=lambda done, total: None):
             if bad:
                 problems.append(f"{name} holds {bad} NaN or infinite values.")
     description = {"kind": reader.kind, "digest": reader.digest}
+    if arrays.get("mask", {}).get("dtype") == "bool":
+        description["invalid_texels"] = int(np.count_nonzero(~reader["mask"]))
     if reader.kind == "sample" and not problems:
         try:
             sample = Sample.from_reader(reader)

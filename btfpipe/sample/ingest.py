@@ -36,7 +36,8 @@ def ingest(
     """Read all pictures of a measurement and write them as a Sample.
 
     Eight-bit pictures are stored as they are, with their transfer curve; others as linear floating point (16-bit floats
-    stay so), unclipped. Resized eight-bit pictures are rounded to eight bits again.
+    stay so), unclipped. Resized eight-bit pictures are rounded to eight bits again. Texels that the measurement's mask leaves
+    out, or of which any source is left out, are stored as 0, which costs no compression anything.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def ingest(
     ------
     InputError
         If a picture cannot be decoded, differs in size or kind, or holds values that are not finite; if a region lies
-        outside the pictures.
+        outside the pictures; if no texel is valid.
     """
     first = measurement.read(0)
     shape = first.shape[:2]
@@ -101,6 +102,7 @@ def ingest(
             " --not-toroidal."
         )
     white = _white(measurement, stored, white, grey_card, grey_card_reflectance, curve)
+    mask = _mask(measurement, (row, col, rows, cols), texels, toroidal)
     eight_bit = first.dtype == np.uint8
     dtype = first.dtype if first.dtype in (np.uint8, np.float16) else np.dtype(np.float32)
     convert = _converter(first.dtype, dtype, curve, (rows, cols), texels, toroidal)
@@ -122,6 +124,8 @@ def ingest(
             pictures[slot] = convert(picture)
         if full and same and pictures.max() == full:
             clipped = [_count_clipped(p, full) for p in pictures if p.max() == full]
+        if mask is not None:
+            pictures[:, ~mask] = 0
         total = None
         if flatten:
             total = np.zeros((*texels, 3))
@@ -139,6 +143,7 @@ def ingest(
         transfer=curve if eight_bit else "linear",
         scale=1.0 if white is None else 1.0 / white,
         toroidal=toroidal,
+        mask=mask,
         texels_per_mm=_density(measurement, texels_per_mm, (rows, cols), texels),
         absolute=white is not None,
     )
@@ -173,18 +178,20 @@ def ingest(
                 done += len(pictures)
                 report(done, n_pairs)
         if flatten:
-            gain = drift_gain(mean / n_pairs)
+            gain = drift_gain(mean / n_pairs, mask)
             writer.array("gain", gain)
             facts["drift"] = float(gain.max() / gain.min() - 1)
         facts["clipped_pixels"] += sum(clipped_in.values())
         facts["clipped_pictures"] += len(clipped_in)
         facts |= _plain_facts(measurement)
+        if mask is not None:
+            facts["invalid_texels"] = sample.n_invalid
         writer.facts["source"] = facts
     said = ("toroidal", "texels_per_mm", "absolute")
     return facts | {key: getattr(sample, key) for key in said}
 
 
-def drift_gain(mean):
+def drift_gain(mean, mask=None):
     """Gain that removes slow drift of brightness from a patch.
 
     The drift is the quadratic in row and column that fits the mean picture best: slow by construction, and free of the
@@ -194,6 +201,8 @@ def drift_gain(mean):
     ----------
     mean : (rows, cols, 3)
         Linear mean over all lights and views.
+    mask : (rows, cols) bool, optional
+        Valid texels, which alone are fitted; all by default.
 
     Returns
     -------
@@ -208,8 +217,11 @@ def drift_gain(mean):
     rows, cols = brightness.shape
     y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
-    fit = np.linalg.lstsq(terms, brightness.ravel(), rcond=None)[0]
+    valid = slice(None) if mask is None else mask.ravel()
+    fit = np.linalg.lstsq(terms[valid], brightness.ravel()[valid], rcond=None)[0]
     drift = (terms @ fit).reshape(rows, cols)
+    if mask is not None:
+        drift[~mask] = drift[mask].mean()  # nothing is known there
     if drift.min() < 0.1 * drift.max():
         raise InputError(
             "--flatten: the mean picture falls to less than a tenth across the patch; that is no slow drift."
@@ -302,6 +314,21 @@ def _inside(region, shape, option, measurement):
             f"{option} {row} {col} {rows} {cols} does not lie inside the pictures of {measurement.source},"
             f" which have {shape[0]} x {shape[1]} pixels."
         )
+
+
+def _mask(measurement, crop, shape, toroidal):
+    """Valid texels of the cropped and resized pictures, or None if all are."""
+    if measurement.mask is None:
+        return None
+    from btfpipe.sample.resize import resize_mask
+
+    row, col, rows, cols = crop
+    mask = resize_mask(measurement.mask[row : row + rows, col : col + cols], shape, toroidal)
+    if not mask.any():
+        raise InputError(
+            f"{measurement.source}: no valid texel is left; choose another --crop or a larger --size."
+        )
+    return None if mask.all() else mask
 
 
 def _white(measurement, stored, white, grey_card, reflectance, curve):

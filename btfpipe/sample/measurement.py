@@ -33,6 +33,8 @@ class Measurement:
     toroidal : bool or None
         None if the source does not say.
     texels_per_mm : float or None
+    mask : (rows, cols) bool or None
+        Valid pixels of the pictures; None if all are.
     facts : dict
         What else the reader found and the summary should say.
     """
@@ -49,6 +51,7 @@ class Measurement:
     white: float | None = None
     toroidal: bool | None = None
     texels_per_mm: float | None = None
+    mask: np.ndarray | None = None
     facts: dict = field(default_factory=dict)
 
     @property

@@ -39,7 +39,7 @@ class Resampled(Appearance):
         self.source = source
         for name in ("light_directions", "view_directions", "light_index", "view_index"):
             setattr(self, name, getattr(target, name))
-        for name in ("shape", "toroidal", "texels_per_mm"):
+        for name in ("shape", "toroidal", "texels_per_mm", "mask"):
             setattr(self, name, getattr(source, name))
         self.absolute = getattr(source, "absolute", False)
         self.about = dict(getattr(source, "about", {}))

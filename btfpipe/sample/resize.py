@@ -34,6 +34,25 @@ class Resizer:
         return out
 
 
+def resize_mask(mask, texels, toroidal=False):
+    """A mask at another size: a texel is valid only if all that `Resizer` makes it of are.
+
+    Parameters
+    ----------
+    mask : (rows, cols) bool
+        Valid texels.
+    texels, toroidal
+        As for `Resizer`.
+
+    Returns
+    -------
+    (rows, cols) bool
+    """
+    invalid = np.repeat(~np.asarray(mask, bool)[..., None], 3, axis=2)
+    share = Resizer(mask.shape, texels, toroidal)(invalid)[..., 0]
+    return share < 1e-6  # a texel that is only touched has a share of rounding
+
+
 def _taps(before, after, toroidal):
     """Inputs (after, taps) int64 of each output texel along one axis, and weights float32 that sum to 1."""
     scale = before / after

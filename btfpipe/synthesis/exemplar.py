@@ -5,8 +5,9 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-from btfpipe.analysis.neighbours import coarse_texel, inside_range
+from btfpipe.analysis.neighbours import bounding_box, coarse_texel, usable_texels
 from btfpipe.errors import InputError
+from btfpipe.hashing import uniform
 from btfpipe.parallel import single_threaded_blas
 
 TABLE_LIMIT = (
@@ -22,8 +23,9 @@ TABLE_LIMIT = (
 Tables = namedtuple("Tables", "side labels table image vectors flat")
 
 # What the search knows of a level: its tables, those of the next coarser one (side 0: none), its
-# neighbour lists (texels, k), the numbers of rows and cols and the texels whose neighbourhood lies inside, and whether it is toroidal.
-Exemplar = namedtuple("Exemplar", "fine coarse lists rows cols inside toroidal")
+# neighbour lists (texels, k), the numbers of rows and cols, the texels whose neighbourhood lies inside and is valid (texels,) bool, the
+# bounds of those, and whether it is toroidal.
+Exemplar = namedtuple("Exemplar", "fine coarse lists rows cols usable inside toroidal")
 
 
 def exemplar(features, level, k=None, distance=None):
@@ -46,7 +48,7 @@ def exemplar(features, level, k=None, distance=None):
     Raises
     ------
     InputError
-        If the lists are missing or too short, or no texel's neighbourhood lies inside the sample.
+        If the lists are missing or too short, or no texel's neighbourhood lies inside the sample and is valid.
     """
     here = features.levels[level]
     below = features.levels[level + 1] if level + 1 < len(features.levels) else None
@@ -67,15 +69,11 @@ def exemplar(features, level, k=None, distance=None):
         )
     else:
         lists = np.ascontiguousarray(here.neighbours[:, :, :k]).reshape(rows * cols, k)
-    coarse_shape = below.shape if below is not None else (0, 0)
-    inside = [
-        bound
-        for size, coarse_size in zip(here.shape, coarse_shape, strict=True)
-        for bound in inside_range(size, coarse_size, side, coarse_side, features.toroidal)
-    ]
-    if inside[0] >= inside[1] or inside[2] >= inside[3] or min(rows, cols) < side:
+    usable = usable_texels(here, below, side, coarse_side, features.toroidal)
+    if not usable.any() or min(rows, cols) < side:
+        valid = "" if here.valid.all() else f" ({int(here.valid.sum())} of them valid)"
         raise InputError(
-            f"level {level} of the sample has {rows} x {cols} texels, too few for a neighbourhood of"
+            f"level {level} of the sample has {rows} x {cols} texels{valid}, too few for a neighbourhood of"
             f" {side} x {side}; take fewer --levels or a larger sample."
         )
     return Exemplar(
@@ -84,7 +82,8 @@ def exemplar(features, level, k=None, distance=None):
         lists,
         rows,
         cols,
-        tuple(int(bound) for bound in inside),
+        usable.ravel(),
+        tuple(bounding_box(usable)),
         features.toroidal,
     )
 
@@ -171,6 +170,18 @@ def texel_under(row, col, exemplar):
 
 
 @njit(cache=True, inline="always")
+def random_texel(sample, usable, seed, item):
+    """A texel to start from: one within the bounds, or where that is not usable one of ``usable`` (n,), which all are."""
+    low, high, left, right = sample.inside
+    r = low + int(uniform(seed, item, 0) * (high - low))
+    c = left + int(uniform(seed, item, 1) * (right - left))
+    texel = r * sample.cols + c
+    if not sample.usable[texel]:
+        texel = usable[int(uniform(seed, item, 2) * len(usable))]
+    return texel
+
+
+@njit(cache=True, inline="always")
 def wrapped(x, size):
     """The coordinate moved by whole periods into [-0.5, size - 0.5)."""
     return x - size * np.floor((x + 0.5) / size)
@@ -182,6 +193,7 @@ __all__ = [
     "coarse_texel",
     "cut",
     "exemplar",
+    "random_texel",
     "texel_under",
     "wrapped",
 ]

@@ -14,13 +14,12 @@ import numpy as np
 from numba import njit
 
 from btfpipe.errors import InputError
-from btfpipe.hashing import uniform
 from btfpipe.parallel import blocks, ordered_map
 from btfpipe.sample.orientation import step_to_texels
 from btfpipe.surface.flatten import PATCH, Flattener, frame_angle
 from btfpipe.synthesis import search
 from btfpipe.synthesis.coordinate_map import CoordinateMap
-from btfpipe.synthesis.exemplar import cut, exemplar
+from btfpipe.synthesis.exemplar import cut, exemplar, random_texel
 
 _BLOCK = 4096  # vertices flattened at once: about 8 MB
 SWEEPS = (16, 3)  # on the coarsest level, on the others
@@ -101,7 +100,7 @@ def grow_over_surface(
         n = len(mesh.vertices)
         state = Grown(np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32))
         if below is None:
-            _scatter(sample, np.uint64(seed), *state)
+            _scatter(sample, np.flatnonzero(sample.usable), np.uint64(seed), *state)
             coarse_label = np.zeros(0, np.int32)
         else:
             _inherit(level, mesh, coarse_mesh, below, coarse_sample, sample, state)
@@ -228,13 +227,13 @@ def mean_edge(level):
 
 
 @njit(cache=True, nogil=True)
-def _scatter(sample, seed, row, col, label):
+def _scatter(sample, usable, seed, row, col, label):
     """A random texel for every vertex."""
-    low, high, left, right = sample.inside
     half = sample.fine.side // 2
     for v in range(row.shape[0]):
-        r = low + int(uniform(seed, v, 0) * (high - low))
-        c = left + int(uniform(seed, v, 1) * (right - left))
+        texel = random_texel(sample, usable, seed, v)
+        r = texel // sample.cols
+        c = texel - r * sample.cols
         row[v] = r
         col[v] = c
         label[v] = sample.fine.labels[r + half, c + half]

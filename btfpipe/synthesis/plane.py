@@ -10,9 +10,8 @@ import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.errors import InputError
-from btfpipe.hashing import uniform
 from btfpipe.synthesis.coordinate_map import CoordinateMap
-from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar
+from btfpipe.synthesis.exemplar import coarse_texel, cut, exemplar, random_texel
 from btfpipe.synthesis.growth import COHERENCE, SWEEPS, summary
 from btfpipe.synthesis.search import (
     CANDIDATES,
@@ -70,7 +69,7 @@ def grow_over_plane(
         rows, cols = shape[0] >> i, shape[1] >> i
         texel = np.empty((rows, cols), np.int32)
         if below is None:
-            _scatter(sample, np.uint64(seed), texel)
+            _scatter(sample, np.flatnonzero(sample.usable), np.uint64(seed), texel)
             coarse = _canvas(sample.coarse, texel)
         else:
             _inherit(below, coarse_sample, sample, texel)
@@ -134,15 +133,11 @@ def _scratch(sample):
 
 
 @leaf
-def _scatter(sample, seed, texel):
+def _scatter(sample, usable, seed, texel):
     """A random texel everywhere."""
-    low, high, left, right = sample.inside
     for r in range(texel.shape[0]):
         for c in range(texel.shape[1]):
-            item = r * texel.shape[1] + c
-            row = low + int(uniform(seed, item, 0) * (high - low))
-            col = left + int(uniform(seed, item, 1) * (right - left))
-            texel[r, c] = row * sample.cols + col
+            texel[r, c] = random_texel(sample, usable, seed, r * texel.shape[1] + c)
 
 
 @leaf
@@ -278,7 +273,7 @@ def grow_rows(
     labels, _, image, sample_width, _, depth = sample.fine.flat
     sample_rows, sample_cols = sample.rows, sample.cols
     toroidal = sample.toroidal
-    lists, inside = sample.lists, sample.inside
+    lists, usable = sample.lists, sample.usable
     compared, slot, places, owners, support, (tries, origin, penalty) = scratch
     compared[:] = -1
     pair = (
@@ -335,8 +330,7 @@ def grow_rows(
                     kappa,
                     full,
                     lists,
-                    sample_cols,
-                    inside,
+                    usable,
                     compared,
                     stamp,
                     tries,

@@ -157,7 +157,7 @@ def scratch_lists(exemplar, owners):
 
 @leaf
 def list_candidates(
-    owners, n, support, kappa, full, lists, cols, inside, compared, stamp, tries, origin, penalty
+    owners, n, support, kappa, full, lists, usable, compared, stamp, tries, origin, penalty
 ):  # fmt: skip
     """The texels to compare: first those that runs lead to, then their lists, or all texels.
 
@@ -167,7 +167,7 @@ def list_candidates(
         Texels that the runs lead to, marked as compared, and the share of the runs that do.
     kappa, full
         As in `grow`.
-    lists, cols, inside
+    lists, usable
         Of the `Exemplar`.
     compared : (texels,) int32
         Holds `stamp` for texels already listed.
@@ -179,12 +179,9 @@ def list_candidates(
     int
         Number listed.
     """
-    low, high, left, right = inside
     count = 0
     for j in range(n):
-        r = owners[j] // cols
-        c = owners[j] - r * cols
-        if low <= r < high and left <= c < right:
+        if usable[owners[j]]:
             tries[count] = owners[j]
             origin[count] = j
             penalty[count] = np.float32(1.0) + kappa * (np.float32(1.0) - support[j])
@@ -201,14 +198,12 @@ def list_candidates(
                 count += compared[texel] != stamp
                 compared[texel] = stamp
     if full or count == 0:
-        for r in range(low, high):
-            for c in range(left, right):
-                texel = r * cols + c
-                if compared[texel] != stamp:
-                    tries[count] = texel
-                    origin[count] = -1
-                    penalty[count] = np.float32(1.0) + kappa
-                    count += 1
+        for texel in range(len(usable)):
+            if usable[texel] and compared[texel] != stamp:
+                tries[count] = texel
+                origin[count] = -1
+                penalty[count] = np.float32(1.0) + kappa
+                count += 1
     return count
 
 
@@ -324,8 +319,7 @@ def grow(
             kappa,
             full,
             exemplar.lists,
-            exemplar.cols,
-            exemplar.inside,
+            exemplar.usable,
             compared,
             i,
             tries,

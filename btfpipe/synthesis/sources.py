@@ -50,11 +50,12 @@ def read_features(
     kind = _kind(path)
     if material is not None and kind not in ("sample", "model"):
         raise no_database(path)
+    mask = None
     if kind == "features":
         features = Features.open(path)
     else:
         if kind in ("sample", "model"):
-            image, toroidal = _appearance_image(path, material, seed, threads, memory)
+            image, toroidal, mask = _appearance_image(path, material, seed, threads, memory)
         elif kind is not None:
             raise InputError(
                 f"{path}: holds a {kind}; expected features, a sample, a model, an array or a picture."
@@ -68,7 +69,12 @@ def read_features(
             image = np.asarray(colours(picture, path), np.float32)
         try:
             features = plain_features(
-                image, toroidal, levels, sample_digest=store.digest(path), source=path.name
+                image,
+                toroidal,
+                levels,
+                mask=mask,
+                sample_digest=store.digest(path),
+                source=path.name,
             )
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
@@ -100,7 +106,7 @@ def _appearance_image(path, material, seed, threads, memory):
     textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
     with single_threaded_blas():
         image = textures @ picture_weights(angular)[:, :_DIMENSIONS]
-    return image, appearance.toroidal
+    return image, appearance.toroidal, appearance.mask
 
 
 def _array(path):

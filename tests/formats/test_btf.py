@@ -514,7 +514,7 @@ def test_bdi_is_turned_into_pictures_within_its_memory(put, rng, packing, memory
         picture = measurement.read(pair)
         assert picture.dtype == np.float16
         np.testing.assert_array_equal(picture, truth[:, :, view, light])
-    assert measurement.facts.get("missing_texels", 0) == (packing == 2) * (~mask).sum()
+    np.testing.assert_array_equal(measurement.mask, mask)
 
 
 @pytest.mark.parametrize("scan_lines", [3, 9])
@@ -801,3 +801,24 @@ def test_a_factored_model_is_not_asked_for_other_terms_in_vain(make_sample, rng,
 def test_an_unknown_cosine_is_refused(put, rng):
     with pytest.raises(InputError, match="expected inside or divided"):
         read_btf(put(dfmf(some_channels(rng))), cosine="outside")
+
+
+@pytest.mark.parametrize("packing", [0, 2])
+def test_the_mask_of_a_bdi_reaches_the_sample(btfpipe, put, rng, tmp_path, packing):
+    values = rng.random((ROWS, COLS, len(VIEWS), len(LIGHTS), 3)).astype(np.float16)
+    mask = rng.random((ROWS, COLS)) < 0.6
+    path = put(bdi(values, packing, mask))
+    assert f"invalid texels: {(~mask).sum()}" in btfpipe("info", path).stdout
+    done = btfpipe("ingest", path, "-o", tmp_path / "s.npz")
+    assert f"invalid texels {(~mask).sum()}" in done.stderr
+    sample = Sample.open(tmp_path / "s.npz")
+    np.testing.assert_array_equal(sample.mask, mask)
+    truth = values.transpose(2, 3, 0, 1, 4).reshape(N_PAIRS, ROWS, COLS, 3)
+    np.testing.assert_array_equal(sample.codes, truth * mask[..., None])
+    assert f"invalid texels: {(~mask).sum()}" in btfpipe("info", tmp_path / "s.npz").stdout
+
+
+def test_an_empty_mask_beside_all_texels_says_nothing(put, rng):
+    values = rng.random((ROWS, COLS, len(VIEWS), len(LIGHTS), 3)).astype(np.float16)
+    assert read_btf(put(bdi(values, mask=np.zeros((ROWS, COLS))))).mask is None
+    assert read_btf(put(bdi(values))).mask is None
