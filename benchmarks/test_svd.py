@@ -128,7 +128,16 @@ def test_svd_is_many_times_faster_than_svds(benchmark, tmp_path):
 
 def test_private_memory(benchmark, tmp_path):
     small = Sample.open(write_sample(tmp_path / "small.npz", 64, 64))
-    run = [sys.executable, "-c", "from btfpipe.cli import main; main()", "compress", "--method", "svd", "-q", "-f"]
+    run = [
+        sys.executable,
+        "-c",
+        "from btfpipe.cli import main; main()",
+        "compress",
+        "--method",
+        "svd",
+        "-q",
+        "-f",
+    ]
     out = tmp_path / "m.npz"
     for times in (1, 2, 4):
         path = write_tiled(tmp_path / "s.npz", small, times)

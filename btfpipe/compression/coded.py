@@ -21,6 +21,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfpipe import store
+from btfpipe.compiled import leaf
 from btfpipe.compression.entropy import decode_planes, encode_planes
 from btfpipe.compression.model import Model, comparison_bytes, measured_error, tables
 from btfpipe.compression.svd import SvdModel, factorise
@@ -37,6 +38,7 @@ _SPARE = 1024  # bytes left for what the caller adds to the description
 _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
 _CLOSE = 0.01  # share of the wanted size by which a file may be smaller
 _MOST_TRIALS = 24
+_TEXELS = 1 << 11  # whose factors stay in the processor's cache for all colours
 _BLOCK = 1 << 14  # rows a matrix product, fixed
 _LARGEST = 1 << 24  # quantised coefficient: the precision of float32
 
@@ -107,10 +109,12 @@ class CodedModel(Model):
 
     def pictures(self, pairs):
         texture = self.texture_factors.reshape(-1, self.n_terms)
-        roots = [
-            angular[pairs] @ texture[:, : angular.shape[1]].T for angular in self.angular_factors
-        ]
-        return self._values(np.stack(roots, axis=-1)).reshape(-1, *self.shape, 3)
+        angular = [a[pairs] for a in self.angular_factors]
+        out = np.empty((len(angular[0]), len(texture), 3), np.float32)
+        for part in blocks(len(texture), _TEXELS):
+            roots = [a @ texture[part, : a.shape[1]].T for a in angular]
+            square(*roots, self.colour, out[:, part])
+        return out.reshape(-1, *self.shape, 3)
 
     def texels(self, rows, cols):
         texture = self.texture_factors[rows, cols]
@@ -125,6 +129,20 @@ class CodedModel(Model):
         from btfpipe.compression.coded_shading import CodedShader
 
         return CodedShader(self, interpolation)
+
+
+@leaf(fastmath={"contract"})
+def square(first, second, third, colour, out):
+    """Fill `out` (n, m, 3) with the values of the roots (n, m) of three colours."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            for c in range(3):
+                root = (
+                    colour[c, 0] * first[i, j]
+                    + colour[c, 1] * second[i, j]
+                    + colour[c, 2] * third[i, j]
+                )
+                out[i, j, c] = root * abs(root)
 
 
 def compress_coded(

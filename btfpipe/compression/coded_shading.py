@@ -3,6 +3,7 @@
 import numpy as np
 
 from btfpipe.compiled import leaf
+from btfpipe.compression.coded import square
 from btfpipe.sample.light_slices import LightSlices
 from btfpipe.sample.shading import PairShader, corners
 
@@ -53,22 +54,8 @@ class CodedShader(PairShader):
         pairs = slice(view * count, (view + 1) * count)
         roots = [near[:, : a.shape[1]] @ a[pairs].T for a in self.angular]
         out = np.empty((len(texels), count, 3), np.float32)
-        _square(*roots, self.colour, out)
+        square(*roots, self.colour, out)
         return out
-
-
-@leaf(fastmath={"contract"})
-def _square(first, second, third, colour, out):
-    """Values of the roots (n, m) of three colours."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            for c in range(3):
-                root = (
-                    colour[c, 0] * first[i, j]
-                    + colour[c, 1] * second[i, j]
-                    + colour[c, 2] * third[i, j]
-                )
-                out[i, j, c] = root * abs(root)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})

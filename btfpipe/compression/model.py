@@ -13,7 +13,7 @@ from btfpipe.sample.appearance import Appearance
 from btfpipe.sample.sample import check_index
 
 _TABLES = ("light_directions", "view_directions", "light_index", "view_index")
-_BLOCK_BYTES = 4 << 20  # linear pictures compared at a time
+_BLOCK_BYTES = 16 << 20  # linear pictures compared at a time; products with few wait for memory
 MOST_ENERGY = 1e38  # sum of squares that a method adds up in single precision
 _LEAST_PICTURES = 8  # however large: what a Model does once for several is then little
 

@@ -344,8 +344,8 @@ class _Passes:
         self.sample, self.rows, self.channels = sample, rows, channels
         self.total, self.on_progress = total, on_progress
         self.texels = sample.shape[0] * sample.shape[1]
-        # pictures decoded at a time
-        self.step = max(LEAST_PICTURES, _DECODED_BYTES // (12 * self.texels))
+        # pictures decoded at a time; each time the whole basis is read
+        self.step = max(LEAST_PICTURES, width // 8, _DECODED_BYTES // (12 * self.texels))
         self.step = min(self.step, math.ceil(sample.n_pairs / _GROUPS))
         self.done = 0
         vectors = 4 * width * self.texels  # one array of as many columns as the subspace
