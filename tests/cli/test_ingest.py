@@ -234,7 +234,7 @@ def test_killed_half_way_the_next_run_ends_with_the_same_bytes(make_measurement,
 
 def test_a_misspelt_setting_is_told_by_name(btfpipe, make_measurement, make_sample, tmp_path):
     def change(members):
-        members["btfpipe.json"] = json.dumps({"wite": 1, "toroidal": True, "title": "cloth"})
+        members["btfpipe.json"] = json.dumps({"whiteness": 1, "toroidal": True, "title": "cloth"})
 
     bonn, _ = make_measurement(change=change)
     make_sample(6, 8).save(tmp_path / "s.npz")
@@ -245,11 +245,11 @@ def test_a_misspelt_setting_is_told_by_name(btfpipe, make_measurement, make_samp
         done = btfpipe("ingest", sets[-1], "-o", tmp_path / "t.npz", "--force")
         assert "unknown" not in done.stderr  # what btfpipe writes itself it knows
         settings = json.loads((sets[-1] / "btfpipe.json").read_text())
-        (sets[-1] / "btfpipe.json").write_text(json.dumps(settings | {"wite": 1}))
+        (sets[-1] / "btfpipe.json").write_text(json.dumps(settings | {"whiteness": 1}))
     for path in sets:
         done = btfpipe("ingest", path, "-o", tmp_path / "t.npz", "--force")
-        assert "Warning: unknown settings 'wite' in btfpipe.json; expected white" in done.stderr
-        assert "unknown settings 'wite' in" in btfpipe("info", path).stdout
+        assert "Warning: unknown settings 'whiteness' in btfpipe.json; expected white" in done.stderr
+        assert "unknown settings 'whiteness' in" in btfpipe("info", path).stdout
 
 
 def test_a_model_is_no_sample(tmp_path):
