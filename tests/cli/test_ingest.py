@@ -248,7 +248,9 @@ def test_a_misspelt_setting_is_told_by_name(btfpipe, make_measurement, make_samp
         (sets[-1] / "btfpipe.json").write_text(json.dumps(settings | {"whiteness": 1}))
     for path in sets:
         done = btfpipe("ingest", path, "-o", tmp_path / "t.npz", "--force")
-        assert "Warning: unknown settings 'whiteness' in btfpipe.json; expected white" in done.stderr
+        assert (
+            "Warning: unknown settings 'whiteness' in btfpipe.json; expected white" in done.stderr
+        )
         assert "unknown settings 'whiteness' in" in btfpipe("info", path).stdout
 
 
