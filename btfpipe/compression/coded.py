@@ -117,18 +117,20 @@ class CodedModel(Model):
         return out.reshape(-1, *self.shape, 3)
 
     def texels(self, rows, cols):
-        texture = self.texture_factors[rows, cols]
-        roots = [texture[:, : a.shape[1]] @ a.T for a in self.angular_factors]
-        return self._values(np.stack(roots, axis=-1))
-
-    def _values(self, roots):
-        roots = roots @ self.colour.T
-        return roots * np.abs(roots)
+        return values_of(self.texture_factors[rows, cols], self.angular_factors, self.colour)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader
 
         return CodedShader(self, interpolation)
+
+
+def values_of(texture, angular, colour):
+    """Values (n, m, 3) float32 of texels' factors (n, terms) with three angular factors (m, at most as many terms)."""
+    roots = [texture[:, : a.shape[1]] @ a.T for a in angular]
+    out = np.empty((len(texture), len(angular[0]), 3), np.float32)
+    square(*roots, colour, out)
+    return out
 
 
 @leaf(fastmath={"contract"})

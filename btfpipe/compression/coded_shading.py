@@ -3,7 +3,7 @@
 import numpy as np
 
 from btfpipe.compiled import leaf
-from btfpipe.compression.coded import square
+from btfpipe.compression.coded import values_of
 from btfpipe.sample.light_slices import LightSlices
 from btfpipe.sample.shading import PairShader, corners
 
@@ -49,13 +49,9 @@ class CodedShader(PairShader):
 
     def seen(self, texels, view):
         """Values (n, lights, 3) float32 of texels (n,) from a measured view under every measured light."""
-        near = self.texture[texels]
         count = len(self.pairs.inverse_cosines)
         pairs = slice(view * count, (view + 1) * count)
-        roots = [near[:, : a.shape[1]] @ a[pairs].T for a in self.angular]
-        out = np.empty((len(texels), count, 3), np.float32)
-        square(*roots, self.colour, out)
-        return out
+        return values_of(self.texture[texels], [a[pairs] for a in self.angular], self.colour)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
