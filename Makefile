@@ -9,7 +9,7 @@ SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: all setup sample gallery formats data-sample test test-slow bench lint fix clean
+.PHONY: all setup sample gallery formats data-sample test test-slow fuzz bench lint fix clean
 
 all: lint test
 
@@ -47,6 +47,11 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest
+
+# The property-based tests on examples that nobody tried before, ROUNDS times.
+ROUNDS ?= 20
+fuzz: $(READY)
+	for round in $$(seq $(ROUNDS)); do HYPOTHESIS_PROFILE=other $(BIN)/python -m pytest -q -m hypothesis || exit 1; done
 
 # Peers that the benchmarks time themselves against are installed here only.
 bench: $(READY)

@@ -56,7 +56,12 @@ class Model(Appearance):
     @classmethod
     def from_reader(cls, reader):
         """Map the Model from its file."""
-        model = cls.from_arrays(reader, read_tables(reader))
+        try:
+            model = cls.from_arrays(reader, read_tables(reader))
+        except InputError as error:
+            if str(reader.path) in str(error):
+                raise
+            raise InputError(f"{reader.path}: {error}") from error  # of a constructor
         mask = model.mask
         if mask is not None and (mask.shape != model.shape or mask.dtype != bool):
             raise InputError(

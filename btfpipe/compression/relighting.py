@@ -27,6 +27,9 @@ _LEAST_COSINE = np.cos(
     np.pi / 2 - 0.01
 )  # harmonics are bent at the horizon; fitters stop short of it
 _QUERIES = 8192  # whose basis is in memory at a time
+# Display values that no picture has, whose linear values (a power of 2.4, of up to four times that by the basis) are still within
+# single precision.
+_MOST_DISPLAY = 1e15
 
 
 def evaluate_basis(kind, n_terms, directions):
@@ -89,7 +92,7 @@ class RelightingModel(Model):
     Raises
     ------
     InputError
-        If shapes and basis do not go together.
+        If shapes and basis do not go together, or scales and offsets are not finite or give display values beyond 1e15.
     """
 
     method = "relighting"
@@ -108,6 +111,12 @@ class RelightingModel(Model):
                 f"{coefficients.shape[2]} channels of coefficients; expected 3, or 1 beside a colour."
             )
         self.coefficients, self.colour = coefficients, colour
+        most = float(np.abs(scale).sum(dtype=float) * 255 + np.abs(offset).sum(dtype=float))
+        if not most < _MOST_DISPLAY:  # NaN too
+            raise InputError(
+                f"scales and offsets of the coefficients allow display values up to {most:.3g}; expected below"
+                f" {_MOST_DISPLAY:g}, with 1 as white. The file is damaged."
+            )
         self.scale, self.offset = (np.asarray(a, np.float32) for a in (scale, offset))
         self.basis, self.transfer = basis, transfer
         self.about |= {"basis": basis, "n_terms": n, "transfer": transfer}

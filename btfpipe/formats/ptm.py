@@ -178,8 +178,6 @@ def _read_hsh(path, head, size, transfer):
     body = _read_body(path, lines.at, 8 * n + rows * cols * 3 * n, size)
     with np.errstate(invalid="ignore"):  # a NaN may warn by itself
         scale, bias = body[: 8 * n].view("<f4").astype(float).reshape(2, n)
-    if not np.isfinite([scale, bias]).all():
-        raise InputError(f"{path}: NaN or infinite scales; the file is damaged.")
     codes = body[8 * n :].reshape(rows, cols, 3, n)
     return _upright(path, codes, scale / 255, bias, None, "hsh", transfer, version.strip("#"))
 
@@ -188,9 +186,8 @@ def _upright(path, codes, scale, offset, colour, basis, transfer, version):
     """A Model from codes whose rows run from the bottom to the top."""
     codes = np.ascontiguousarray(codes[::-1])
     colour = None if colour is None else np.ascontiguousarray(colour[::-1])
-    with np.errstate(over="ignore"):
-        scale, offset = (np.asarray(a).astype(np.float32) for a in (scale, offset))
-    if not np.isfinite([scale, offset]).all():
-        raise InputError(f"{path}: scales or biases beyond single precision; the file is damaged.")
     about = {"source": {"format": version, "source_transfer": transfer}}
-    return RelightingModel(codes, scale, offset, colour, basis, transfer, about=about)
+    try:
+        return RelightingModel(codes, scale, offset, colour, basis, transfer, about=about)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

@@ -151,3 +151,14 @@ def test_what_does_not_go_together_is_refused(rng):
     ):
         with pytest.raises(InputError, match=match):
             RelightingModel(codes, np.ones(6), np.ones(6), **good | change)
+
+
+@pytest.mark.parametrize("name", ["scale", "offset"])
+@pytest.mark.parametrize("value", [1e13, np.inf, np.nan])
+def test_values_that_no_picture_has_are_refused_naming_the_file(tmp_path, name, value):
+    codes = np.zeros((2, 2, 3, 6), np.uint8)
+    model = RelightingModel(codes, np.ones(6), np.ones(6), None, "ptm", "srgb")
+    setattr(model, name, np.full(6, value * (1 if name == "scale" else 255), np.float32))
+    model.save(tmp_path / "mine.npz")
+    with pytest.raises(InputError, match=r"mine\.npz: .* display values up to"):
+        open_appearance(tmp_path / "mine.npz")

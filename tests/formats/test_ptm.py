@@ -158,14 +158,31 @@ def test_a_wrong_header_is_refused_with_the_reason(tmp_path, kind, old, new, mat
         read_model(tmp_path / "mine")
 
 
-@pytest.mark.parametrize("bits", [0x7FC00000, 0x7FA00000, 0x7F800000])  # NaN, a signalling one, inf
-def test_scales_that_are_no_numbers_are_refused(tmp_path, bits):
+@pytest.mark.parametrize("place", [0, 9])  # a scale, a bias
+@pytest.mark.parametrize(  # NaN, a signalling one, inf, 1.7e38, 2.4e15, -2.4e15
+    "bits", [0x7FC00000, 0x7FA00000, 0x7F800000, 0x7F000000, 0x59086A00, 0xD9086A00]
+)
+def test_scales_that_no_picture_has_are_refused(tmp_path, bits, place):
     data = bytearray(whole("hsh"))
-    at = data.index(b"9 2 1\n") + 6
+    at = data.index(b"9 2 1\n") + 6 + 4 * place
     data[at : at + 4] = struct.pack("<I", bits)
     (tmp_path / "mine").write_bytes(data)
-    with pytest.raises(InputError, match="NaN or infinite"):
+    with pytest.raises(InputError, match="mine: .* display values up to"):
         read_model(tmp_path / "mine")
+
+
+@pytest.mark.parametrize(
+    "kind, place, bits", [("hsh", 0, b"\xff\xff\x0f\x53"), ("hsh", 9, b"\0\0\x80\x57")]
+)
+def test_values_far_beyond_white_are_finite(tmp_path, kind, place, bits):
+    """Damaged or not, what is read has linear values in single precision (a power of 2.4 of these display values)."""
+    data = bytearray(whole(kind))
+    at = data.index(b"9 2 1\n") + 6 + 4 * place
+    data[at : at + 4] = bits
+    (tmp_path / "mine").write_bytes(data)
+    values = read_model(tmp_path / "mine").pictures(slice(None))
+    assert np.isfinite(values).all()
+    assert values.max() > 1e20
 
 
 def test_other_files_are_not_taken_for_ptms(tmp_path):
