@@ -11,7 +11,10 @@ BDI   half floats, one texel's lights and views after the other  `Measurement`
 
 Nothing is expanded: factors stay mapped from the file. All sizes that a file declares are held against its own length
 before anything is read, and a file must end exactly where they say. `btf_header` reads what all kinds begin with,
-`btf_bodies` the rest of each; `btf_writing` writes a DFMF.
+`btf_bodies` the rest of factorisations, `btf_pictures` of the others; `btf_writing` writes a DFMF.
+
+Any kind may hold spectra: more or fewer channels than three, whose names are wavelengths. They become linear Rec. 709 values as seen
+under D65, taking 1 for white at any wavelength. A DFMF of spectra, and an FMF of them in logarithms, is read as a `Measurement`.
 
 What no measured file has confirmed yet:
 
@@ -22,13 +25,17 @@ What no measured file has confirmed yet:
   light's cosine as a factor. `cosine` overrides that.
 - Lab is taken under D50 to linear Rec. 709, as the other colour models are linear; the makers' library gives display values
   there. The RGB scale factors of the header are reported, not applied.
+- Spectra in colour model 6 are decoded as the makers' library does, whose first channel is not what is left of the mean.
+- Chunks of a BDI that are packed by bzip2 are taken for one stream each, of the same bytes as other chunks; the makers' library does
+  not read them.
 - The mask of a BDI is taken with columns fastest, as the makers' library writes it (it reads it the other way). Texels where it
   is 0 are invalid, whether values of them are stored or not; a mask that is 0 everywhere beside all texels says nothing.
 """
 
 from btfpipe.errors import InputError
-from btfpipe.formats.btf_bodies import read_bdi, read_dfmf, read_fmf, read_pvf
+from btfpipe.formats.btf_bodies import read_dfmf, read_fmf
 from btfpipe.formats.btf_header import MappedFile, read_header
+from btfpipe.formats.btf_pictures import read_bdi, read_pvf
 
 # By signature, longest first: kind, whether the header is extended, whether rotations follow.
 SIGNATURES = {
@@ -74,7 +81,7 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
     cosine : str, optional
         ``inside`` or ``divided``: what was done with the light's cosine, whatever the file's flag says.
     memory : int
-        Bytes in which to turn a BDI's values into pictures; each filling reads the file once.
+        Bytes in which to turn a BDI's values, or a DFMF's spectra, into pictures; each filling reads the file once.
 
     Returns
     -------
@@ -85,7 +92,7 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
     ------
     InputError
         Naming the section: another format, a size that the file's length does not bear, trailing bytes, counts that
-        contradict each other, values that are not finite, or a variety that is not read (bzip, spectral).
+        contradict each other, values that are not finite, or channels that are neither colours nor wavelengths.
     """
     if cosine not in (None, "inside", "divided"):
         raise InputError(f"cosine {cosine!r}; expected inside or divided.")
@@ -101,10 +108,10 @@ def read_btf(path, *, cosine=None, memory=1 << 30):
     file.take(len(signature), "signature")
     header = read_header(file, kind, signature, cosine)
     bodies = {
-        "DFMF": read_dfmf,
-        "FMF": lambda file, header: read_fmf(file, header, extended),
-        "PVF": read_pvf,
-        "BDI": lambda file, header: read_bdi(file, header, memory),
+        "DFMF": lambda: read_dfmf(file, header, memory),
+        "FMF": lambda: read_fmf(file, header, memory, extended),
+        "PVF": lambda: read_pvf(file, header),
+        "BDI": lambda: read_bdi(file, header, memory),
     }
     return _with_rotations(file, header, rotations and not header.legacy, bodies[kind])
 
@@ -113,7 +120,7 @@ def _with_rotations(file, header, rotations, body):
     """Read the body behind the rotations, whose numbers some writers take for 9 and some for 3 a frame."""
     (count,) = file.unpack("I", "rotations") if rotations else (0,)
     if count == 0:
-        return body(file, header)
+        return body()
     header.facts["rotations"] = count
     start, first = file.at, None
     for each in (9, 3):
@@ -121,7 +128,7 @@ def _with_rotations(file, header, rotations, body):
             file.at = start
             file.need(4 * each * count, f"rotations ({each} numbers a frame)")
             file.at += 4 * each * count
-            return body(file, header)
+            return body()
         except InputError as error:
             if file.at == file.size:  # the sizes fit, so something else is wrong
                 raise

@@ -12,8 +12,11 @@ import numpy as np
 
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
+from btfpipe.sample.colour import spectrum_to_rgb
 
 _LEGACY_PVF = 301074
+_SCALARS = {2: np.dtype("<f2"), 4: np.dtype("<f4"), 8: np.dtype("<f8")}
+_WAVELENGTH = re.compile(r"(\d{2,5}(?:\.\d*)?) *(?:nm)?")
 _OURS = re.compile(rb'<btfpipe toroidal="(true|false)" absolute="(true|false)"/>')
 
 
@@ -64,6 +67,13 @@ class MappedFile:
         self.at += array.nbytes
         return array
 
+    def scalar(self, section):
+        """The type of the numbers that follow, from the byte that gives their size."""
+        (size,) = self.unpack("B", section)
+        if size not in _SCALARS:
+            raise self.wrong(f"{section}: bytes of a number", size, "2, 4 or 8")
+        return _SCALARS[size]
+
     def finish(self):
         """Refuse bytes after the last section."""
         if self.at != self.size:
@@ -85,6 +95,9 @@ class Header:
     light_index, view_index : (pairs,) int32
         Of a product, light fastest.
     rows, cols : int
+    n_channels : int
+    to_rgb : (3, n_channels) float32 or None
+        Linear Rec. 709 values of spectra, whose channels are wavelengths; None where they are red, green and blue.
     toroidal, absolute : bool
         As our own files say it, else False.
     texels_per_mm : float or None
@@ -93,13 +106,14 @@ class Header:
     legacy : bool
         Whether it is a PVF from before the meta block; then `n_factorised` is its number of views.
     scan_lines, packing, mask
-        Of a BDI: rows a chunk, 0 (all texels) or 2 (those of the mask), and (rows * cols,) uint8.
+        Of a BDI: rows a chunk; 0 (all texels), 1 (all, by bzip2) or 2 (those of the mask); and (rows * cols,) uint8.
     facts : dict
         For the result.
     """
 
     toroidal = absolute = legacy = False
-    texels_per_mm = flag = None
+    texels_per_mm = flag = to_rgb = None
+    n_channels = 3
 
     def __init__(self, kind, signature):
         self.facts = {"format": f"Bonn .btf, {kind}", "signature": signature.decode()}
@@ -164,7 +178,7 @@ def _read_meta(file, header):
         header.texels_per_mm = density
     if all(map(math.isfinite, scale)) and any(s not in (0.0, 1.0) for s in scale):
         header.facts["rgb_scale"] = list(scale)
-    channels = 3
+    names = ()
     if version > 1:
         header.flag = file.unpack("I", section)[0]
         if header.flag > 1:
@@ -174,20 +188,35 @@ def _read_meta(file, header):
         if ours:
             header.toroidal, header.absolute = (value == b"true" for value in ours.groups())
     if version > 3:
-        (channels,) = file.unpack("I", section)
-        file.need(4 * channels, f"{section}: channel names")
+        header.n_channels = file.count(f"{section}: number of channels")
+        file.need(4 * header.n_channels, f"{section}: channel names")
         names = [
             file.take(file.unpack("I", section)[0], f"{section}: channel names")
-            for _ in range(channels)
+            for _ in range(header.n_channels)
         ]
     if file.at != start + size:
         raise file.wrong(f"{section}: size", size, f"{file.at - start}, where its fields end")
-    if channels != 3:
-        some = ", ".join(name.decode("latin-1") for name in names[:3])
+    if header.n_channels != 3:
+        _read_wavelengths(file, header, [name.decode("latin-1").strip("\0 ") for name in names])
+
+
+def _read_wavelengths(file, header, names):
+    """What the channels of spectra count as red, green and blue."""
+    found = [_WAVELENGTH.fullmatch(name) for name in names]
+    if not all(found):
+        bad = names[found.index(None)]
         raise InputError(
-            f"{file.path}: {channels} channels ({some} ...); expected 3, red, green and blue. Spectral data are"
-            " not read."
+            f"{file.path}: {header.n_channels} channels, one of them {bad[:20]!r}; expected 3 (red, green and blue), or names"
+            " that are wavelengths in nanometres."
         )
+    wavelengths = np.array([float(match[1]) for match in found])
+    try:
+        header.to_rgb = spectrum_to_rgb(wavelengths).astype(np.float32)
+    except InputError as error:
+        raise InputError(f"{file.path}: channels: {error}") from error
+    header.facts["spectra"] = (
+        f"{header.n_channels} wavelengths, {wavelengths.min():g} to {wavelengths.max():g} nm, as seen under D65"
+    )
 
 
 def _read_directions(file, header):
@@ -230,7 +259,6 @@ def _read_mask(file, header):
     """How a BDI is packed, and the mask of its texels."""
     header.scan_lines = file.count("scan lines a chunk")
     (header.packing,) = file.unpack("B", "compression")
-    if header.packing not in (0, 2):
-        found = "1 (bzip)" if header.packing == 1 else header.packing
-        raise file.wrong("compression", found, "0 (all texels) or 2 (sparse)")
+    if header.packing not in (0, 1, 2):
+        raise file.wrong("compression", header.packing, "0 (none), 1 (bzip2) or 2 (sparse)")
     header.mask = file.array((header.rows * header.cols,), np.dtype("u1"), "mask")
