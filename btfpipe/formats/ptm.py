@@ -1,7 +1,8 @@
 """What is fitted to RTI pictures: polynomial texture maps (``.ptm``) and hemispherical harmonics (``.rti``), as Models.
 
 Their coefficients are bytes and stay so. They give display values, whose curve the files do not name: sRGB unless told
-otherwise, and recorded.
+otherwise, and recorded. Planes packed by JPEG are read, with their prediction from each other but without motion; JPEG-LS, look-up tables
+and LUM are not.
 """
 
 from pathlib import Path
@@ -10,11 +11,13 @@ import numpy as np
 
 from btfpipe.compression.relighting import TERMS, RelightingModel
 from btfpipe.errors import InputError
+from btfpipe.formats.images import Decoder
 
 _MOST_HEADER = 1 << 16
 _MOST_PIXELS = 2**28
 _VERSIONS = ("PTM_1.0", "PTM_1.1", "PTM_1.2")
-_BYTES = {"PTM_FORMAT_RGB": 18, "PTM_FORMAT_LRGB": 9}  # a texel
+_PLANES = {"PTM_FORMAT_RGB": 18, "PTM_FORMAT_LRGB": 9}  # bytes a texel
+_PLANES |= {"PTM_FORMAT_JPEG_RGB": 18, "PTM_FORMAT_JPEG_LRGB": 9}
 _TYPES = {1: "PTM", 2: "spherical harmonics", 4: "an adaptive basis"}  # of .rti files, besides 3
 
 
@@ -33,7 +36,7 @@ def recognise(path):
 
 
 def read_model(path, *, transfer="srgb"):
-    """Read a ``.ptm`` (RGB or LRGB, versions 1.0 to 1.2) or a ``.rti`` of hemispherical harmonics.
+    """Read a ``.ptm`` (RGB or LRGB, plain or by JPEG, versions 1.0 to 1.2) or a ``.rti`` of hemispherical harmonics.
 
     Parameters
     ----------
@@ -49,7 +52,7 @@ def read_model(path, *, transfer="srgb"):
     Raises
     ------
     InputError
-        If it is another file, truncated, goes on after its end, or is compressed by JPEG.
+        If it is another file, truncated, goes on after its end, or is packed otherwise than by JPEG.
     """
     path = Path(path)
     try:
@@ -131,29 +134,88 @@ def _read_ptm(path, head, size, transfer):
     version, kind = lines.next(), lines.next()
     if version not in _VERSIONS:
         raise InputError(f"{path}: version {version!r}; expected {', '.join(_VERSIONS)}.")
-    if kind not in _BYTES:
-        packed = "JPEG" in kind
+    if kind not in _PLANES:
         raise InputError(
-            f"{path}: {kind[:40]!r} is {'compressed by JPEG' if packed else 'not supported'}; expected"
-            f" {' or '.join(_BYTES)}. Save it as one of these, or ingest the pictures with their .lp."
+            f"{path}: {kind[:40]!r} is not supported; expected {', '.join(_PLANES)}. Save it as one of these, or ingest the"
+            " pictures with their .lp."
         )
     numbers = lines.numbers(14)
     rows, cols = _size(path, *numbers[:2])
-    texels = rows * cols
-    body = _read_body(path, lines.at, texels * _BYTES[kind], size)
-    colour = None
-    if kind == "PTM_FORMAT_RGB":
-        codes = body.reshape(3, rows, cols, 6).transpose(1, 2, 0, 3)
-    elif version == "PTM_1.2":
-        codes = body[: 6 * texels].reshape(rows, cols, 1, 6)
-        colour = body[6 * texels :].reshape(rows, cols, 3)
-    else:  # nine bytes together
-        body = body.reshape(rows, cols, 1, 9)
-        codes, colour = body[..., :6], body[..., 0, 6:]
+    texels, n = rows * cols, _PLANES[kind]
+    if "JPEG" in kind:
+        planes = _read_jpegs(path, lines, size, rows, cols, n)
+    else:
+        body = _read_body(path, lines.at, texels * n, size)
+        if kind == "PTM_FORMAT_RGB":  # six bytes together, three times
+            planes = body.reshape(3, rows, cols, 6).transpose(1, 2, 0, 3)
+        elif version == "PTM_1.2":  # six bytes together, then three
+            parts = body[: 6 * texels], body[6 * texels :]
+            planes = np.concatenate([part.reshape(rows, cols, -1) for part in parts], axis=2)
+        else:  # nine bytes together
+            planes = body.reshape(rows, cols, 9)
+    if n == 18:
+        codes, colour = planes.reshape(rows, cols, 3, 6), None
+    else:
+        codes, colour = planes[:, :, None, :6], planes[:, :, 6:]
     scale, bias = numbers[2:8], numbers[8:]
     return _upright(
         path, codes, scale / 255, -bias * scale / 255, colour, "ptm", transfer, f"{version} {kind}"
     )
+
+
+def _read_jpegs(path, lines, size, rows, cols, n):
+    """Planes (rows, cols, n) uint8, each a grey JPEG: of itself, or of what it differs by from a plane that comes before it.
+
+    After the scales and biases come the quality and seven numbers a plane: how it is predicted, a motion in x and in y, its
+    place in the order of decoding, the plane that it is predicted from, the bytes of its JPEG, and those of its corrections,
+    which are five bytes each: where, and the right value.
+    """
+    numbers = lines.numbers(1 + 7 * n)[1:].reshape(7, n)
+    inverted, _, _, order, reference, packed, corrected = numbers.astype(int)
+    known = (numbers == np.round(numbers)).all() and np.isin(inverted, [0, 1]).all()
+    if not known or numbers[1:3].any() or (reference < -1).any() or (reference >= n).any():
+        raise InputError(
+            f"{path}: its planes are predicted from each other in a way that is not read (motion), or their numbers are damaged."
+        )
+    first = reference == -1  # a plane comes after that from which it is predicted
+    late = (order[reference] < order) | first
+    if sorted(order) != list(range(n)) or not late.all() or min(*packed, *corrected) < 0:
+        raise InputError(f"{path}: the order or the sizes of its planes are damaged.")
+    body = _read_body(path, lines.at, int(packed.sum() + corrected.sum()), size)
+    ends = np.cumsum(packed + corrected)
+    planes = [None] * n
+    with Decoder() as decoder:
+        for c in np.argsort(order):
+            jpeg, corrections = np.split(
+                body[ends[c] - packed[c] - corrected[c] : ends[c]], packed[[c]]
+            )
+            name = f"{path}: plane {c}"
+            plane = decoder.decode(jpeg.tobytes(), name).values
+            if plane.shape != (rows, cols, 1) or plane.dtype != np.uint8:
+                raise InputError(
+                    f"{name}: {' x '.join(map(str, plane.shape))} {plane.dtype}; expected {rows} x {cols}, grey, 8 bits."
+                )
+            plane = plane[..., 0]
+            if not first[c]:  # modulo 256, as bytes are
+                other = planes[reference[c]]
+                plane = plane + (255 - other if inverted[c] else other) - np.uint8(128)
+            planes[c] = _corrected(name, plane, corrections)
+    return np.stack(planes, axis=2)
+
+
+def _corrected(name, plane, corrections):
+    """A plane with values put right, each by four bytes that say where, the highest first, and the value."""
+    if len(corrections) % 5:
+        raise InputError(f"{name}: {len(corrections)} bytes of corrections; expected fives.")
+    corrections = corrections.reshape(-1, 5)
+    where = np.ascontiguousarray(corrections[:, :4]).view(">u4")[:, 0]
+    if (where >= plane.size).any():
+        raise InputError(
+            f"{name}: a correction at {where.max()} of {plane.size} texels; the file is damaged."
+        )
+    plane = plane.copy()
+    plane.reshape(-1)[where] = corrections[:, 4]
+    return plane
 
 
 def _read_hsh(path, head, size, transfer):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from btfpipe.errors import InputError
 from btfpipe.formats import ptm
+from btfpipe.formats.images import encode_picture, read_picture
 from btfpipe.formats.ptm import read_model
 
 SCALES = np.array([0.5, 2.0, 0.25, 1.0, 1.5, 1.0])
@@ -34,6 +35,49 @@ def ptm_file(kind, codes, colour=None, version="PTM_1.2", end="\n", one_line=Fal
             for j in range(cols):
                 body += upside_down[i, j, 0].tobytes() + colour[rows - 1 - i, j].tobytes()
     return (end.join(head) + end).encode() + body
+
+
+def jpeg_file(codes, colour, chosen, side=None, end="\n"):
+    """Bytes of a PTM of grey JPEGs, and its planes as they must come back, (rows, cols, n) from the top.
+
+    `chosen`: for each plane the place in the order, the plane that it is predicted from or -1, and whether inverted.
+    `side`: by plane, flat places from the bottom and values.
+    """
+    rows, cols = codes.shape[:2]
+    planes = codes.reshape(rows, cols, -1)
+    planes = (planes if colour is None else np.concatenate([planes, colour], axis=2))[::-1]
+    n, side = planes.shape[2], side or {}
+    back, packed, notes = np.zeros(planes.shape, np.uint8), [b""] * n, [b""] * n
+    for c in sorted(range(n), key=lambda c: chosen[c][0]):
+        _, reference, inverted = chosen[c]
+        assumed = np.full((rows, cols), 128)
+        if reference >= 0:
+            assumed = back[..., reference].astype(int)
+            assumed = 255 - assumed if inverted else assumed
+        left = ((planes[..., c].astype(int) - assumed + 128) % 256).astype(np.uint8)
+        packed[c] = encode_picture(left, ".jpg", 100)
+        seen = read_picture(packed[c])[..., 0].astype(int)
+        back[..., c] = (seen + assumed - 128) % 256
+        for place, value in side.get(c, ()):
+            back[place // cols, place % cols, c] = value
+            notes[c] += struct.pack(">IB", place, value)
+    order, reference, inverted = zip(*chosen, strict=True)
+    numbers = [
+        [100],
+        inverted,
+        [0] * n,
+        [0] * n,
+        order,
+        reference,
+        map(len, packed),
+        map(len, notes),
+    ]
+    kind = "PTM_FORMAT_JPEG_RGB" if colour is None else "PTM_FORMAT_JPEG_LRGB"
+    head = ["PTM_1.2", kind, str(cols), str(rows), " ".join(f"{s:.6f}" for s in SCALES)]
+    head += [" ".join(map(str, some)) for some in (BIASES, *numbers)]
+    return (end.join(head) + end).encode() + b"".join(
+        jpeg + note for jpeg, note in zip(packed, notes, strict=True)
+    ), back[::-1]
 
 
 def hsh_file(codes, scales, biases, end="\n", comment=""):
@@ -85,6 +129,81 @@ def test_polynomial_texture_maps_are_read(tmp_path, rng, kind, version, end, one
     assert "PTM" in ptm.recognise(tmp_path / "a.ptm")
 
 
+@pytest.mark.parametrize("kind", ["PTM_FORMAT_JPEG_RGB", "PTM_FORMAT_JPEG_LRGB"])
+@pytest.mark.parametrize("predicted", [False, True])
+def test_maps_packed_by_jpeg_are_read(tmp_path, rng, kind, predicted):
+    channels = 3 if kind.endswith("_RGB") else 1
+    smooth = np.add.outer(np.arange(12) * 5, np.arange(10) * 7)[..., None]
+    n = 6 * channels
+    codes = (
+        ((smooth * rng.random(n) + 100 * rng.random(n)) % 256)
+        .astype(np.uint8)
+        .reshape(12, 10, channels, 6)
+    )
+    colour = (smooth[..., [0, 0, 0]] + [3, 9, 100]).astype(np.uint8) if channels == 1 else None
+    n += 0 if colour is None else 3
+    chosen, side = [(c, -1, 0) for c in range(n)], {}
+    if (
+        predicted
+    ):  # the last plane first; each second one from the next, every fourth of those inverted
+        chosen = [
+            (n - 1 - c, c + 1 if c % 2 == 0 and c < n - 1 else -1, int(c % 4 == 0))
+            for c in range(n)
+        ]
+        side = {1: [(0, 7), (119, 250)], 4: [(13, 0)]}
+    data, back = jpeg_file(codes, colour, chosen, side)
+    (tmp_path / "a.ptm").write_bytes(data)
+    model = read_model(tmp_path / "a.ptm")
+    coefficients = model.coefficients.reshape(12, 10, -1)
+    np.testing.assert_array_equal(coefficients, back[..., : 6 * channels])
+    if colour is not None:
+        np.testing.assert_array_equal(model.colour, back[..., 6:])
+        assert abs(model.colour.astype(int) - colour).max() < 12  # as far as a JPEG goes
+    check(
+        model,
+        back[..., : 6 * channels].reshape(codes.shape),
+        None if colour is None else back[..., 6:],
+        rng,
+    )
+    assert model.about["source"]["format"] == f"PTM_1.2 {kind}"
+
+
+def a_jpeg_file():
+    rng = np.random.default_rng(4)
+    codes, colour = (
+        rng.integers(0, 256, (3, 4, 1, 6), np.uint8),
+        rng.integers(0, 256, (3, 4, 3), np.uint8),
+    )
+    chosen = [(c, c - 1, 0) for c in range(9)]
+    return jpeg_file(codes, colour, chosen, {2: [(5, 9)]})[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        (b"\n0 0 0 0 0 0 0 0 0\n0 0", b"\n2 0 0 0 0 0 0 0 0\n0 0", "in a way that is not read"),
+        (b"\n0 1 2 3", b"\n1 0 2 3", "the order or the sizes"),
+        (b"\n0 1 2 3", b"\n0 0 2 3", "the order or the sizes"),
+        (b"\n-1 0 1 2", b"\n-1 0 1 9", "in a way that is not read"),
+        (b"\n-1 0 1 2", b"\n-1 0 1 3", "the order or the sizes"),
+        (b"\n-1 0 1 2", b"\n-1 0.5 1 2", "in a way that is not read"),
+        (b"\n4\n3\n", b"\n3\n4\n", "plane 0: 3 x 4 x 1 uint8; expected 4 x 3, grey"),
+        (b"\n4\n3\n", b"\n9999\n9999\n", "plane 0: 3 x 4 x 1"),
+        (b"\n0 0 5 0", b"\n0 0 4 0", "1 bytes follow"),
+        (b"\n0 0 5 0", b"\n0 0 9 0", "truncated"),
+        (b"\0\0\0\5\t", b"\0\0\0\x0c\t", "plane 2: a correction at 12 of 12"),
+        (b"\xff\xd8\xff", b"\xff\xd8\xfe", "plane 0"),
+    ],
+)
+def test_damaged_maps_packed_by_jpeg_are_refused(tmp_path, old, new, match):
+    data = a_jpeg_file()
+    assert old in data
+    (tmp_path / "mine").write_bytes(data.replace(old, new, 1))
+    with pytest.raises(InputError, match=match) as caught:
+        read_model(tmp_path / "mine")
+    assert "mine" in str(caught.value)
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     st.integers(1, 6), st.integers(1, 6), st.sampled_from([1, 4, 9, 16]), st.integers(0, 2**32 - 1),
@@ -108,6 +227,8 @@ def test_harmonics_are_read(tmp_path_factory, rows, cols, terms, seed, end, comm
 
 
 def whole(kind):
+    if "JPEG" in kind:
+        return a_jpeg_file()
     rng = np.random.default_rng(4)
     if kind == "hsh":
         return hsh_file(rng.integers(0, 256, (3, 4, 3, 9), np.uint8), rng.random(9), rng.random(9))
@@ -115,10 +236,13 @@ def whole(kind):
     return ptm_file(kind, codes, rng.integers(0, 256, (3, 4, 3), np.uint8))
 
 
-@pytest.mark.parametrize("kind", ["PTM_FORMAT_RGB", "PTM_FORMAT_LRGB", "hsh"])
+@pytest.mark.parametrize(
+    "kind", ["PTM_FORMAT_RGB", "PTM_FORMAT_LRGB", "PTM_FORMAT_JPEG_LRGB", "hsh"]
+)
 def test_every_cut_and_every_addition_is_noticed(tmp_path, kind):
     data, path = whole(kind), tmp_path / "mine"
-    for spoiled in [data[:n] for n in range(len(data))] + [data + b"more", data + bytes(range(99))]:
+    cuts = range(0, len(data), 1 + len(data) // 500)
+    for spoiled in [data[:n] for n in cuts] + [data + b"more", data + bytes(range(99))]:
         path.write_bytes(spoiled)
         with pytest.raises(InputError, match="mine: "):
             read_model(path)
@@ -130,7 +254,7 @@ def test_every_cut_and_every_addition_is_noticed(tmp_path, kind):
     ("kind", "old", "new", "match"),
     [
         ("PTM_FORMAT_RGB", b"PTM_1.2", b"PTM_2.0", "version 'PTM_2.0'"),
-        ("PTM_FORMAT_RGB", b"FORMAT_RGB", b"FORMAT_JPEG_RGB", "compressed by JPEG.*ingest the pictures"),
+        ("PTM_FORMAT_RGB", b"FORMAT_RGB", b"FORMAT_JPEGLS_RGB", "not supported.*ingest the pictures"),
         ("PTM_FORMAT_RGB", b"FORMAT_RGB", b"FORMAT_LUM", "not supported"),
         ("PTM_FORMAT_RGB", b"\n4\n3\n", b"\n4000\n3000\n", "calls for 216000000 bytes"),
         ("PTM_FORMAT_RGB", b"\n4\n3\n", b"\n400000\n300000\n", "at most"),
