@@ -135,7 +135,8 @@ def read_factored_spectra(file, header, angular, texture, undo, memory):
     windows = _Windows(
         fill, header, 8, memory
     )  # twice single precision: as channels and as pictures
-    header.facts["terms"] = ", ".join(str(factors.shape[1]) for factors in angular)
+    terms = [factors.shape[1] for factors in angular]
+    header.facts["terms"] = f"{min(terms)} to {max(terms)} a channel"
     return _measurement(file, header, windows.picture)
 
 
