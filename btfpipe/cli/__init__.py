@@ -69,7 +69,10 @@ class _Stages(click.Group):
             formatter.write_dl(list(STAGES.items()))
 
 
-@click.group(cls=_Stages, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Stages,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+)
 @click.version_option(__version__, prog_name="btfpipe")
 def main():
     """Dress surfaces in measured or simulated bidirectional texture functions.

@@ -15,7 +15,6 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
     "--method",
     type=click.Choice(_METHODS),
     default="coded",
-    show_default=True,
     help="coded: square roots of the values factorised, quantised and entropy-coded to a wanted size; best by far for its bytes. svd: full-matrix singular value decomposition (Zhou et al. 2005). view-pca: principal pictures of each view (Wang et"
     " al. 2009). local-pca: clusters of texels with a PCA each (Müller et al. 2007); several samples make a database. harmonics:"
     " spherical harmonics over views and lights (Leung et al. 2007). factored: channel by channel, as in Bonn's .btf files.",

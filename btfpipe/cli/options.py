@@ -58,11 +58,11 @@ def _common(out):
     """The options that mean the same everywhere."""
     options = [
         click.option("-f", "--force", is_flag=True, help="Replace the output if it exists."),
-        click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
+        click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0,
                      help="Seed of everything random; the same seed gives the same bytes."),
         click.option("-t", "--threads", type=click.IntRange(min=1), default=available_threads,
                      show_default="all processors", help="Threads; never changes the result."),
-        click.option("--memory", type=Memory(), default="2G", show_default=True,
+        click.option("--memory", type=Memory(), default="2G",
                      help="Working memory to stay within, such as 512M or 2G."),
         click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
         click.option("-q", "--quiet", is_flag=True, help="No progress, no summary."),

@@ -33,7 +33,6 @@ def _not_nan(context, parameter, value):
     "--layer",
     type=click.Choice(["colour", "alpha", "depth", "normal", "texel"]),
     default="colour",
-    show_default=True,
     help="Layer of rendered pictures to show.",
 )
 @click.option(

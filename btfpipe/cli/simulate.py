@@ -23,14 +23,12 @@ _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
     "file_format",
     type=click.Choice(list(_SUFFIXES)),
     default="jpeg",
-    show_default=True,
     help="jpeg and png hold sRGB; exr holds linear half floats, unclipped.",
 )
 @click.option(
     "--quality",
     type=click.IntRange(1, 100),
     default=92,
-    show_default=True,
     help="Of JPEG, in per cent.",
 )
 @stage(folder=True)

@@ -13,14 +13,12 @@ from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
     "--vertices",
     type=click.IntRange(100, 20_000_000),
     default=250_000,
-    show_default=True,
     help="Vertices to resample to, met within 5 %.",
 )
 @click.option(
     "--levels",
     type=click.IntRange(1, 8),
     default=3,
-    show_default=True,
     help="Levels of the pyramid; each has a quarter of the vertices of the one before.",
 )
 @click.option(
@@ -32,7 +30,6 @@ from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
     "--turn-deg",
     type=FiniteFloat(),
     default=0.0,
-    show_default=True,
     help="Turn the whole field counter-clockwise, degrees.",
 )
 @click.option(
@@ -45,7 +42,6 @@ from btfpipe.cli.options import FiniteFloat, input_file, progress, stage
 @click.option(
     "--smooth/--no-smooth",
     default=True,
-    show_default=True,
     help="Round coarse facets off (Phong tessellation), or stay on the faces of the input.",
 )
 @stage()

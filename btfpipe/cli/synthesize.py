@@ -42,7 +42,6 @@ class _Plane(click.ParamType):
     "--search",
     type=click.Choice(["k-coherent", "full"]),
     default="k-coherent",
-    show_default=True,
     help="Candidates for each vertex: those that its surroundings suggest, or all texels.",
 )
 @click.option(
@@ -50,14 +49,12 @@ class _Plane(click.ParamType):
     "k",
     type=click.IntRange(min=1),
     default=11,
-    show_default=True,
     help="Texels tried for each suggestion; 1 (Ashikhmin) suits natural textures of small objects.",
 )
 @click.option(
     "--levels",
     type=click.IntRange(1, 6),
     default=3,
-    show_default=True,
     help="Levels of the pyramids to use.",
 )
 @click.option(
@@ -74,21 +71,18 @@ class _Plane(click.ParamType):
     "--turn-deg",
     type=FiniteFloat(),
     default=0.0,
-    show_default=True,
     help="Angle of the sample's right-hand axis from the vector field, counter-clockwise, degrees.",
 )
 @click.option(
     "--coherence",
     type=FiniteFloat(min=0),
     default=0.4,
-    show_default=True,
     help="By how much nearer a texel must be that breaks a run; 0: not at all, as published.",
 )
 @click.option(
     "--sweeps",
     type=(click.IntRange(min=1), click.IntRange(min=1)),
     default=(16, 3),
-    show_default=True,
     help="Walks over the coarsest level, and over each other level.",
 )
 @click.option(

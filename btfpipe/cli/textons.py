@@ -11,7 +11,6 @@ from btfpipe.cli.options import input_file, material_option, naming, progress, s
     "--levels",
     type=click.IntRange(1, 6),
     default=3,
-    show_default=True,
     help="Levels of the texton pyramid; each halves the sides.",
 )
 @click.option(
@@ -19,7 +18,6 @@ from btfpipe.cli.options import input_file, material_option, naming, progress, s
     "n_textons",
     type=click.IntRange(min=2),
     default=400,
-    show_default=True,
     help="Textons of the finest level; a quarter a level from there on. More keep larger pieces of a regular"
     " material whole: try 1600 where they break up.",
 )
@@ -27,21 +25,18 @@ from btfpipe.cli.options import input_file, material_option, naming, progress, s
     "--images",
     type=click.IntRange(min=1),
     default=400,
-    show_default=True,
     help="Representative pictures that the textons are made from; all, if there are fewer.",
 )
 @click.option(
     "--neighbourhood",
     type=click.IntRange(min=1),
     default=5,
-    show_default=True,
     help="Side of the square neighbourhood, texels, odd.",
 )
 @click.option(
     "--coarse-neighbourhood",
     type=click.IntRange(min=1),
     default=3,
-    show_default=True,
     help="Side of the square on the next coarser level, texels, odd.",
 )
 @click.option(
@@ -49,7 +44,6 @@ from btfpipe.cli.options import input_file, material_option, naming, progress, s
     "k",
     type=click.IntRange(min=1),
     default=20,
-    show_default=True,
     help="Length of the neighbour lists, the texel itself included; the most that synthesis can use.",
 )
 @material_option
