@@ -335,6 +335,8 @@ def _kmeans(vectors, count, seed):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
+        # where containers hide them; one thread is used whatever their number
+        warnings.filterwarnings("ignore", "Could not find the number of physical cores")
         labels = KMeans(count, n_init=1, random_state=seed).fit(vectors).labels_
     used, labels = np.unique(labels, return_inverse=True)
     return len(used), labels.astype(np.int64)
