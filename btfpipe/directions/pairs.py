@@ -23,8 +23,8 @@ class NearestPairs:
     count : int
         Pairs that share a query.
     reciprocal : bool
-        Every pair also stands for the one with light and view exchanged (Helmholtz: value / cos(theta_i) is the same).
-        On a flat patch seen with parallax that holds for the material, not texel by texel.
+        Every pair also stands for the one with light and view exchanged (Helmholtz: value / cos(theta_i) is the same), unless
+        that one is measured, too. On a flat patch seen with parallax that holds for the material, not texel by texel.
 
     Raises
     ------
@@ -40,9 +40,12 @@ class NearestPairs:
             raise InputError(
                 "a pair's light or view points below the surface; only the upper hemisphere can be interpolated."
             )
-        self.n_pairs = len(points)
+        self._pair = np.arange(len(points))  # of each point
         if reciprocal:
-            points = np.concatenate([points, points[:, [3, 4, 5, 0, 1, 2]]])
+            exchanged = points[:, [3, 4, 5, 0, 1, 2]]
+            new = cKDTree(points).query(exchanged)[0] > _SAME
+            points = np.concatenate([points, exchanged[new]])
+            self._pair = np.concatenate([self._pair, self._pair[new]])
         self.count = min(count, len(points))
         self._tree = cKDTree(points)
         # with all pairs in use none is left out: none is farther than the diameter of both spheres
@@ -64,7 +67,7 @@ class NearestPairs:
         exact = distance[:, 0] <= _SAME
         shares[exact] = 0
         shares[exact, 0] = 1
-        pair[:, : self.count] = index % self.n_pairs
+        pair[:, : self.count] = self._pair[index]
         weight[:, : self.count] = shares / shares.sum(axis=1, keepdims=True)
         pair[:, self.count :] = 0
         weight[:, self.count :] = 0

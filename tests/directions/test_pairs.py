@@ -72,6 +72,21 @@ def test_reciprocal_pairs_answer_for_exchanged_directions():
     np.testing.assert_array_equal(weight[:, 0], 1)
 
 
+def test_exchanged_pairs_give_way_to_measured_ones():
+    """A product has both (a, b) and (b, a), whose pictures differ by parallax."""
+    directions = scattered(9, 1)
+    lights, views = np.tile(directions, (9, 1)), np.repeat(directions, 9, axis=0)
+    near = NearestPairs(lights, views, 9, reciprocal=True)
+    pair, weight = weights(near, lights, views)
+    np.testing.assert_array_equal(pair[:, 0], np.arange(81))
+    np.testing.assert_array_equal(weight[:, 0], 1)
+    aside = lights + [[1e-5, 0, 0]]  # next to a pair, its value
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    values = np.random.default_rng(3).random(81)
+    pair, weight = weights(near, aside, views)
+    np.testing.assert_allclose((values[pair] * weight).sum(axis=1), values, atol=1e-3)
+
+
 def test_directions_below_the_surface_are_taken_at_the_horizon():
     near = NearestPairs(scattered(30, 1), scattered(30, 2), 9)
     below, level = from_angles([np.pi / 2 + 0.2], [0.7]), from_angles([np.pi / 2], [0.7])
