@@ -80,7 +80,7 @@ def test_exchanged_pairs_give_way_to_measured_ones():
     pair, weight = weights(near, lights, views)
     np.testing.assert_array_equal(pair[:, 0], np.arange(81))
     np.testing.assert_array_equal(weight[:, 0], 1)
-    aside = lights + [[1e-5, 0, 0]]  # next to a pair, its value
+    aside = lights + np.array([1e-5, 0, 0])  # next to a pair, its value
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     values = np.random.default_rng(3).random(81)
     pair, weight = weights(near, aside, views)
