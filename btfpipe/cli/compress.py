@@ -63,6 +63,11 @@ _SPACES = {"linear": "ycocg", "log": "log_y_uv_over_y"}
     help="Harmonics over the lights: a square number.  [default: 25]",
 )
 @click.option(
+    "--equal-views",
+    is_flag=True,
+    help="Weigh all views alike in the fit of harmonics, rather than by their squared cosines.",
+)
+@click.option(
     "--precision",
     type=click.Choice(["half", "single", "byte"]),
     help="Numbers in the file: 2, 4 or 1 bytes each; byte for view-pca and local-pca.  [default: half]",
@@ -95,7 +100,8 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
     from btfpipe.metrics import raw_bytes
     from btfpipe.sample import Sample
 
-    options["resample"] = options["resample"] or None  # as the others: None if not given
+    for name in ("resample", "equal_views"):
+        options[name] = options[name] or None  # as the others: None if not given
     if options["space"] is not None:
         options["space"] = _SPACES[options["space"]]
     apart = options["space"] is not None or options["channel_components"] is not None

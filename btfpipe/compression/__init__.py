@@ -53,7 +53,11 @@ METHODS = {
         "btfpipe.compression.harmonics",
         "HarmonicsModel",
         "compress_harmonics",
-        {"view_harmonics": "view_terms", "light_harmonics": "light_terms"},
+        {
+            "view_harmonics": "view_terms",
+            "light_harmonics": "light_terms",
+            "equal_views": "equal_views",
+        },
     ),
     "coded": Method(
         "btfpipe.compression.coded",

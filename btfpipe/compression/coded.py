@@ -32,7 +32,7 @@ from btfpipe.sample.transfer import decode_table
 
 _TERMS = 256
 _RATIO = 100.0
-_ROUND = 0.4  # coefficients round up from here: a little more error, clearly fewer bytes
+_ROUND = 0.4  # added before rounding down: halves count as less, which is a little more error and clearly fewer bytes
 _SPARSE = 400  # a colour of a term with fewer coefficients than one in so many is not worth its time in shading
 _SPARE = 1024  # bytes left for what the caller adds to the description
 _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples

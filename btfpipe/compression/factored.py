@@ -15,6 +15,7 @@ from btfpipe.errors import InputError
 
 EPSILON = 1e-5  # added inside logarithms by the ``.btf`` formats
 _MOST_CHROMA = 4.0  # of |U| / Y and |V| / Y; colours without negative channels stay below 3.83
+_NOTICED = 0.01  # share of the largest luminance that chroma may lose without a word
 
 RGB, YUV, LAB, PCA, YCOCG = 0, 1, 2, 3, 4
 LOG_Y_UV, LOG_Y_SLOG_UV, LOG_Y_UV_OVER_Y, LOG_RGB = 9, 10, 11, 12
@@ -261,7 +262,7 @@ def compress_factored(
     total = sum(pictures_to_read(sample, n, 1, iterations, False) for n in terms) + sample.n_pairs
     into = _into(space)
     done, angular, texture, facts = 0, [], [], []
-    least = []
+    extremes = []
 
     def report(read, _):
         if on_progress is not None:
@@ -273,7 +274,9 @@ def compress_factored(
             planar = planar_pictures(sample, pairs)
             values = planar.reshape(-1, 3, planar.shape[1])
             out = np.empty((len(values), values.shape[2]), np.float32)
-            least.append(_encode_channel(values, SPACES[space], into, np.float32(epsilon), c, out))
+            extremes.append(
+                _encode_channel(values, SPACES[space], into, np.float32(epsilon), c, out)
+            )
             return out
 
         vectors, weights, found = factorise(
@@ -291,7 +294,7 @@ def compress_factored(
         "precision": precision,
         **{key: [f[key] for f in facts] for key in ("iterations", "excess", "singular_values")},
         **measured_error(model, sample, threads=threads, on_progress=report),
-        "warnings": _negative(min(least), epsilon)
+        "warnings": _losses(np.array(extremes), epsilon)
         + [
             f"channel {c}: {warning}"
             for c, (n, fact) in enumerate(zip(terms, facts, strict=True), 1)
@@ -301,13 +304,21 @@ def compress_factored(
     return model
 
 
-def _negative(least, epsilon):
-    """A warning, in a list, if logarithms were asked of values further below 0 than what is added to them."""
-    if least >= -epsilon:
-        return []
-    return [
-        f"values go down to {least:.3g}, and logarithms take those below 0 for 0; choose --space linear, or another method"
-    ]
+def _losses(extremes, epsilon):
+    """Warnings of what logarithmic spaces cannot hold, from what `_encode_channel` returned, call by call."""
+    least, (most, cut) = extremes[:, 0].min(), extremes[:, 1:].max(axis=0)
+    choose = "choose --space linear, or another method"
+    warnings = []
+    if least < -epsilon:  # further below 0 than what is added
+        warnings.append(
+            f"values go down to {least:.3g}, and logarithms take those below 0 for 0; {choose}"
+        )
+    if cut > _NOTICED * most:
+        warnings.append(
+            f"colours with channels below 0 lose up to {cut:.3g} of their chroma (luminance goes up to {most:.3g}), as U / Y and V / Y"
+            f" are kept within {_MOST_CHROMA:g}; {choose}"
+        )
+    return warnings
 
 
 def _into(space):
@@ -396,10 +407,11 @@ def _decode_all(a, b, c, space, matrix, mean, epsilon, log_range, out):
 def _encode_channel(values, space, into, epsilon, channel, out):
     """Fill ``out`` (pairs, texels) with one channel of linear pictures (pairs, 3, texels).
 
-    Returns the least value of which a logarithm was taken as of 0, or 0.
+    Returns the least value of which a logarithm was taken as of 0, or 0; the largest luminance that divided chroma; and the most
+    that chroma lost, both as values.
     """
     zero = np.float32(0)
-    least = zero
+    least = most = cut = zero
     for p in range(values.shape[0]):
         for t in range(values.shape[2]):
             r, g, b = values[p, 0, t], values[p, 1, t], values[p, 2, t]
@@ -409,6 +421,8 @@ def _encode_channel(values, space, into, epsilon, channel, out):
                 x = np.log(max(x, zero) + epsilon)  # NaN stays: the comparison is false
             elif space == LOG_Y_UV_OVER_Y:
                 y = max(into[0, 0] * r + into[0, 1] * g + into[0, 2] * b, zero) + epsilon
+                most = max(most, y)
+                cut = max(cut, abs(x) - np.float32(_MOST_CHROMA) * y)
                 x = min(max(x / y, np.float32(-_MOST_CHROMA)), np.float32(_MOST_CHROMA))
             elif space == LOG_Y_SLOG_UV:
                 # below epsilon the sign alone would remain; 0 decodes to 0
@@ -424,4 +438,4 @@ def _encode_channel(values, space, into, epsilon, channel, out):
                 else:
                     x = np.float32(200.0 * (fy - _lab(x / _Z0)))
             out[p, t] = x
-    return least
+    return least, most, cut

@@ -2,12 +2,12 @@
 
 Each texel and channel is a matrix of coefficients C (view terms x light terms), found by constrained least squares:
 first over the views under each light, then over the lights of each view coefficient (the other order is as good to
-0.2 dB; the paper does not say). Directions cover the upper hemisphere only, where the harmonics are far from orthogonal, so that plain least squares answers noise with huge coefficients.
+0.3 dB; the paper does not say). Directions cover the upper hemisphere only, where the harmonics are far from orthogonal, so that plain least squares answers noise with huge coefficients.
 The constraint keeps the squares of each vector of coefficients within the energy of its values, mirrored to the whole
 sphere: the smallest lambda of ``(Y^T Y + lambda I) c = Y^T f`` with ``c^T c <= E = (4 pi / M) sum f^2``.
 
-Views are weighted by their squared cosines (`view_weights`), where the paper does not say; on three materials this gives 1.3 to 2.2 dB
-(display PSNR over views as a picture has them).
+Views are weighted by their squared cosines (`view_weights`), where the paper does not say. Over views as a picture has them that is 0 to 1.1 dB
+better (display PSNR, four materials) and keeps deep grooves from turning black; over all measured pairs alike the linear error is 2 to 9 % higher.
 
 With ``Y^T Y`` diagonalised once, lambda is a root of a sum over the terms. Where the paper bisects, Newton's method on
 ``1 / |c|`` (Moré and Sorensen 1983) climbs to the same root in about five steps: that function is concave, so that
@@ -172,6 +172,7 @@ def compress_harmonics(
     light_terms=25,
     *,
     penalty=None,
+    equal_views=False,
     seed=0,
     threads=1,
     memory=2 << 30,
@@ -187,6 +188,8 @@ def compress_harmonics(
         Square numbers, no more than there are views and lights.
     penalty : float, optional
         One lambda for all vectors, in place of the smallest that meets each one's constraint.
+    equal_views : bool
+        Weigh all views alike, in place of `view_weights`.
     seed : int
         Of no effect: nothing is random.
     threads : int
@@ -200,7 +203,7 @@ def compress_harmonics(
     Returns
     -------
     HarmonicsModel
-        Its ``about`` holds `view_terms`, `light_terms`, `penalty`, `warnings`, and, measured on the codes over all linear
+        Its ``about`` holds `view_terms`, `light_terms`, `penalty`, `equal_views`, `warnings`, and, measured on the codes over all linear
         values, `rmse` and `relative_error` (RMS of the error over RMS of the values).
 
     Raises
@@ -214,7 +217,7 @@ def compress_harmonics(
         raise InputError(f"penalty {penalty}; expected a number of 0 or more.")
     views, lights = sample.view_directions, sample.light_directions
     fits = [
-        _Fit(views, view_terms, "views", penalty, view_weights(views)),
+        _Fit(views, view_terms, "views", penalty, 1.0 if equal_views else view_weights(views)),
         _Fit(lights, light_terms, "lights", penalty),
     ]
     with single_threaded_blas():
@@ -226,6 +229,7 @@ def compress_harmonics(
         "view_terms": fits[0].terms,
         "light_terms": fits[1].terms,
         "penalty": penalty,
+        "equal_views": equal_views,
         "warnings": [fit.warning for fit in fits if fit.warning],
         "rmse": math.sqrt(squared_error / count),
         "relative_error": math.sqrt(squared_error / energy) if energy > 0 else 0.0,
@@ -468,8 +472,11 @@ class _Lines:
             coefficients = self._fit(values)
             if self.kept is not None:
                 self.kept[row, cols.start] = coefficients
-            low, high = (np.empty(shape, np.float32) for _ in range(2))
-            _range(coefficients.reshape(*self.terms, -1, 3), low, high)
+            low, high = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+            coefficients = coefficients.reshape(*self.terms, -1, 3)
+            if self.sample.mask is not None:  # what an invalid texel holds is nobody's value
+                coefficients = coefficients[:, :, self.sample.mask[row, cols]]
+            _range(np.ascontiguousarray(coefficients), low, high)
             return low, high, square
 
         for low, high, square in self._blocks(work):
@@ -509,12 +516,11 @@ def _decode(codes, table, out):
 
 @njit(cache=True, nogil=True)
 def _range(coefficients, low, high):
-    """Fill the least and the greatest (3, view terms, light terms) of coefficients (view terms, light terms, texels, 3)."""
+    """Widen the least and the greatest (3, view terms, light terms) by coefficients (view terms, light terms, texels, 3)."""
     for i in range(coefficients.shape[0]):
         for j in range(coefficients.shape[1]):
             for c in range(3):
-                least = coefficients[i, j, 0, c]
-                most = least
+                least, most = low[c, i, j], high[c, i, j]
                 for t in range(coefficients.shape[2]):
                     least = min(least, coefficients[i, j, t, c])
                     most = max(most, coefficients[i, j, t, c])

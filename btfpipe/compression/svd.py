@@ -1,4 +1,4 @@
-"""Full-matrix SVD (Zhou et al. 2005, section 4): texels x (pairs and channels), n terms, no mean removed.
+"""Full-matrix SVD (Zhou et al. 2005, section III): texels x (pairs and channels), n terms, no mean removed.
 
 The product of two factors: eigen-textures over the texels, and angular factors over pairs and channels, whose
 linear combination gives any picture. Its error is the least that n terms can have (Eckart-Young).

@@ -196,7 +196,12 @@ def _spread(lamps, cameras, patch_cm, reference):
         facts[f"{name}_spread_deg"] = float(angle.max())
         facts[f"median_{name}_spread_deg"] = float(np.median(angle))
     distance = np.linalg.norm(lamps, axis=1)
-    across = (np.linalg.norm(lamps[:, None] - corners, axis=2) / distance[:, None]) ** 3
+    # a corner is the farthest from a lamp; the nearest may lie between
+    nearest = np.clip(lamps * [1, 1, 0], corners.min(axis=0), corners.max(axis=0))
+    places = np.concatenate(
+        [np.broadcast_to(corners, (len(lamps), 4, 3)), nearest[:, None]], axis=1
+    )
+    across = (np.linalg.norm(lamps[:, None] - places, axis=2) / distance[:, None]) ** 3
     facts |= {
         "patch_cm": (float(height), float(width)),
         "lamp_distance_cm": (float(distance.min()), float(distance.max())),

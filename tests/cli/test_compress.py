@@ -135,6 +135,7 @@ def test_what_is_no_sample_is_refused_and_nothing_is_written(btfpipe, make_sampl
             "two ways to say the same",
         ),
         (("--method", "harmonics", "--view-harmonics", 7), 3, "square number"),
+        (("--equal-views",), 2, "coded has no --equal-views"),
         (("--memory", "9" * 400), 2, "more memory than any machine has"),
     ],
 )
@@ -153,6 +154,7 @@ def test_impossible_options_are_refused(btfpipe, sample_file, tmp_path, options,
         ("--method", "view-pca", "--components", 4, "--precision", "byte"),
         ("--method", "local-pca", "--clusters", 3, "--components", 5),
         ("--method", "harmonics", "--view-harmonics", 4, "--light-harmonics", 9),
+        ("--method", "harmonics", "--view-harmonics", 4, "--light-harmonics", 9, "--equal-views"),
     ],
 )
 def test_every_method_makes_a_model_whose_summary_is_true(btfpipe, sample_file, tmp_path, options):

@@ -106,9 +106,34 @@ def test_values_below_zero_are_said_to_be_lost_in_logarithms(make_sample, space)
     sample.codes[3] = 0
     assert compress_factored(sample, (2, 1, 1), space).about["warnings"] == []
     sample.codes = sample.codes - np.float32(0.05)
-    (warning,) = compress_factored(sample, (2, 1, 1), space).about["warnings"]
+    warning, *more = compress_factored(sample, (2, 1, 1), space).about["warnings"]
+    assert len(more) == (space == "log_y_uv_over_y")  # that loses chroma, too
     assert warning.startswith("values go down to -0.05, and logarithms take those below 0 for 0")
     assert compress_factored(sample, (2, 1, 1), "ycocg").about["warnings"] == []
+
+
+def test_colours_outside_the_gamut_are_said_to_be_cut(make_sample):
+    """With all terms, the error is what the limit of U / Y takes; the warning says how much of U that is at most."""
+    sample = make_sample(rows=4, cols=5)
+    inside, warning = of_all_terms(sample)
+    assert warning is None
+    rgb = [0.057, -0.061, 0.848]
+    sample.codes[:, 1, 2] = rgb
+    sample.codes[:, 3, 3] *= 1e-4  # dark noise is nobody's colour
+    outside, warning = of_all_terms(sample)
+    assert outside > 10 * inside
+    y, u, _ = np.linalg.solve([[1, 0, 1.13983], [1, -0.39465, -0.5806], [1, 2.03211, 0]], rgb)
+    assert warning.startswith(
+        f"colours with channels below 0 lose up to {u - 4 * (y + 1e-5):.3g} of their chroma"
+    )
+    assert of_all_terms(sample, "ycocg")[1] is None
+
+
+def of_all_terms(sample, space="log_y_uv_over_y"):
+    """The largest error, and what is warned of colours."""
+    model = compress_factored(sample, (20, 20, 20), space, precision="single")
+    warning = next((w for w in model.about["warnings"] if w.startswith("colours")), None)
+    return np.abs(model.pictures(slice(None)) - sample.pictures(slice(None))).max(), warning
 
 
 def test_threads_and_memory_never_show(make_sample, tmp_path):

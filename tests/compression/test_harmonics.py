@@ -148,15 +148,17 @@ def test_scaled_values_have_scaled_coefficients(rng):
         np.testing.assert_allclose(found / scale, plain, atol=2e-4 * np.abs(plain).max())
 
 
-def test_the_whole_is_that_of_a_loop_over_texels(rng):
-    """Views first, weighted by their squared cosines, then lights, a vector at a time, without codes."""
+@pytest.mark.parametrize("equal", [False, True])
+def test_the_whole_is_that_of_a_loop_over_texels(rng, equal):
+    """Views first, weighted by their squared cosines or not, then lights, a vector at a time, without codes."""
     sample = smooth_sample(rng, 2, 2, noise=0.02)
-    model = compress_harmonics(sample, 9, 16)
+    model = compress_harmonics(sample, 9, 16, equal_views=equal)
+    weights = np.ones(81) if equal else squared_cosines(bonn81())
     values = whole(sample).reshape(81, 81, 2, 2, 3)
     views, lights = (spherical_harmonics(bonn81(), n) for n in (9, 16))
     for row, col, channel in ((0, 0, 0), (1, 0, 2), (1, 1, 1)):
         matrix = values[:, :, row, col, channel].astype(float)
-        by_light = np.stack([naive(f, views, squared_cosines(bonn81())) for f in matrix.T], axis=1)
+        by_light = np.stack([naive(f, views, weights) for f in matrix.T], axis=1)
         both = np.stack([naive(f, lights, np.ones(81)) for f in by_light])
         found = model.texels([row], [col])[0, :, channel].reshape(81, 81)
         assert np.abs(found - views @ both @ lights.T).max() < worst_step(model) + 1e-3
@@ -320,6 +322,21 @@ def test_directions_that_tell_too_few_harmonics_apart_are_warned_of(rng):
     assert "36 terms are what these directions support" in model.about["warnings"][0]
     assert model.about["relative_error"] < 0.02
     assert compress_harmonics(smooth_sample(rng, 1, 2), 16, 36).about["warnings"] == []
+
+
+def test_invalid_texels_do_not_coarsen_the_codes_of_the_others(rng):
+    sample = smooth_sample(rng, 2, 40)
+    whole_range = compress_harmonics(sample, 9, 9)
+    mask = np.ones((2, 40), bool)
+    mask[0, 3:30] = mask[1, :] = False
+    sample.codes[:, ~mask] = 9
+    sample.mask = mask
+    model = compress_harmonics(sample, 9, 9)
+    assert (model.step() <= whole_range.step()).all()
+    sample.codes[:, ~mask] = -9
+    again = compress_harmonics(sample, 9, 9)
+    np.testing.assert_array_equal(again.step(), model.step())
+    np.testing.assert_array_equal(again.coefficient_codes[mask], model.coefficient_codes[mask])
 
 
 def test_a_black_sample_becomes_a_black_model():

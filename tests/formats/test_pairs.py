@@ -151,6 +151,10 @@ def test_pictures_under_near_lamps_become_those_of_distant_ones(tmp_path):
     ]  # fmt: skip
     np.testing.assert_allclose(facts["view_spread_deg"], max(angles))
     assert 5 < facts["light_spread_deg"] < 20
+    fine = np.concatenate(
+        [correction((501, 401), patch, lamp, np.linalg.norm(lamp)).ravel() for lamp in lamps]
+    )
+    np.testing.assert_allclose(facts["correction_over_patch"], [fine.min(), fine.max()], rtol=0.01)
 
 
 def test_eight_bit_pictures_are_linear_before_they_are_corrected(tmp_path):
