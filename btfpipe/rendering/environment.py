@@ -48,6 +48,7 @@ class Environment:
     projection : str
     turn : (3, 3) float64
     visible : bool
+    name : str
 
     Raises
     ------
@@ -74,6 +75,7 @@ class Environment:
                 f"{name}: {cols} x {rows} pixels; an angular probe is a square of at least 4 x 4."
             )
         self.projection, self.visible, self.values = projection, visible, values
+        self.name = name
         self.turn = np.eye(3) if turn is None else np.asarray(turn, float)
         self._used = self._grid()[1] > 0
         _require_radiance(values, self._used, name)

@@ -43,12 +43,19 @@ _ASIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def project_environment(environment, terms):
-    """Coefficients (terms, 3) of an `Environment`'s radiance, in the scene's axes."""
+    """Coefficients (terms, 3) of an `Environment`'s radiance, in the scene's axes.
+
+    Raises
+    ------
+    InputError
+        If the map has too few rows of pixels for so many terms.
+    """
     rows = environment.values.shape[0]
     if rows < 2 * highest_degree(terms) + 1:
+        most = ((rows - 1) // 2 + 1) ** 2
         raise InputError(
-            f"{environment.name or 'the environment'}: {rows} rows of pixels are too few for {terms} harmonics; ask"
-            f" for fewer terms."
+            f"{environment.name or 'the environment'}: {rows} rows of pixels tell fewer than {terms} harmonics apart; ask for"
+            f" {most} terms at most, or give a larger map."
         )
     directions, solid_angles, radiances = environment.pixels()
     out = np.zeros((terms, 3))
@@ -66,8 +73,7 @@ class HarmonicEnvironment:
     ----------
     model : HarmonicsModel
     coefficients : (n, 3)
-        Of the environment's radiance in world axes, as `project_picture` gives them for a picture whose pole is
-        the world's z axis; at least `terms` of them.
+        Of the environment's radiance in world axes, as `project_environment` gives them; at least `terms` of them.
     terms : int, optional
         The environment's terms to use, a square number; 169 by default, or as many as there are if fewer.
 

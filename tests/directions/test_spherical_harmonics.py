@@ -9,10 +9,7 @@ from btfpipe.directions import from_angles, to_angles
 from btfpipe.directions.spherical_harmonics import (
     hemisphere_products,
     highest_degree,
-    picture_directions,
-    picture_weights,
     project_function,
-    project_picture,
     quadrature,
     rotate_coefficients,
     rotation_blocks,
@@ -122,34 +119,17 @@ def test_products_of_one_parity_are_half_the_spheres():
     assert np.abs(products[~even]).max() > 0.3
 
 
-def test_projection_gives_back_the_coefficients_of_functions_and_pictures(rng):
+def test_projection_gives_back_the_coefficients_of_functions(rng):
     coefficients = rng.standard_normal((49, 3))
     np.testing.assert_allclose(
         project_function(lambda d: spherical_harmonics(d, 49) @ coefficients, 49),
         coefficients,
         atol=1e-12,
     )
-    picture = spherical_harmonics(picture_directions(14, 20).reshape(-1, 3), 49) @ coefficients
-    found = project_picture(picture.reshape(14, 20, 3), 49)
-    np.testing.assert_allclose(found, coefficients, atol=1e-12)
-    np.testing.assert_allclose(
-        project_picture(picture.reshape(14, 20, 3)[..., 0], 25), coefficients[:25, 0], atol=1e-12
-    )
 
 
-@pytest.mark.parametrize(("rows", "cols"), [(1, 1), (16, 32), (33, 17)])
-def test_pixels_of_a_picture_fill_the_sphere(rows, cols):
-    weights = picture_weights(rows, cols)
-    assert (weights > 0).all()
-    assert cols * weights.sum() == pytest.approx(4 * np.pi)
-
-
-def test_bad_numbers_and_pictures_are_refused():
+def test_numbers_that_are_no_squares_are_refused():
     assert highest_degree(169) == 12
     for terms in (0, -4, 24, 26):
         with pytest.raises(InputError, match=f"{terms} spherical harmonics.*square number"):
             highest_degree(terms)
-    with pytest.raises(InputError, match=r"expected at least \(9, 9\)"):
-        project_picture(np.ones((8, 16, 3)), 25)
-    with pytest.raises(InputError, match="1 NaN or infinite"):
-        project_picture(np.where(np.arange(512).reshape(16, 32) == 5, np.inf, 1.0), 25)

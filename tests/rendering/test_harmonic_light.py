@@ -7,13 +7,13 @@ from btfpipe.compression.harmonics import compress_harmonics
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.directions.spherical_harmonics import (
     project_function,
-    project_picture,
     quadrature,
     rotate_coefficients,
     spherical_harmonics,
 )
 from btfpipe.errors import InputError
-from btfpipe.rendering.harmonic_light import HarmonicEnvironment
+from btfpipe.rendering.environment import Environment
+from btfpipe.rendering.harmonic_light import HarmonicEnvironment, project_environment
 from btfpipe.sample import Sample
 
 
@@ -76,6 +76,40 @@ def test_it_equals_the_sum_over_the_hemisphere(model, rng, terms):
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+def map_directions(rows, cols):
+    """Of a map's pixels, in its own axes: y up, -z in the middle."""
+    y, x = 1 - 2 * (np.mgrid[:rows, :cols] + 0.5) / [[[rows]], [[cols]]]
+    if cols == 2 * rows:
+        theta, phi = np.pi / 2 * (1 - y), -np.pi * x
+        return np.stack(
+            [np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1
+        )
+    radius = np.hypot(x, y)
+    away = np.sin(np.pi * radius) / radius
+    return np.stack([-x * away, y * away, -np.cos(np.pi * radius)], axis=-1)
+
+
+@pytest.mark.parametrize("shape", [(64, 128), (128, 128)])
+def test_a_map_has_the_coefficients_of_the_function_that_it_shows(rng, shape):
+    axes, _, _, turn = turns(rng, 4)
+
+    def sky(directions):
+        return np.exp(2 * (directions @ axes.T - 1))
+
+    values = sky(map_directions(*shape) @ turn.T).astype(np.float32)
+    found = project_environment(Environment(values, turn=turn), 49)
+    expected = project_function(sky, 49)
+    assert np.abs(expected[1:]).max() > 0.3
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_a_map_too_small_for_its_terms_is_refused_by_name():
+    small = Environment(np.ones((16, 32, 3), np.float32), name="sky.exr")
+    with pytest.raises(InputError, match=r"sky\.exr: 16 rows of pixels .* 64 terms at most"):
+        project_environment(small, 169)
+    assert np.isfinite(project_environment(small, 64)).all()
+
+
 def test_a_white_diffuser_under_a_white_sky_is_white():
     directions = bonn81()
     values = directions[None, :, 2, None, None, None] * np.ones((81, 81, 1, 1, 3))
@@ -83,7 +117,7 @@ def test_a_white_diffuser_under_a_white_sky_is_white():
         np.round(255 * values.reshape(6561, 1, 1, 3) ** (1 / 2.2)).astype(np.uint8),
         directions, directions, np.arange(6561) % 81, np.arange(6561) // 81, transfer="gamma2.2",
     )  # fmt: skip
-    white = project_picture(np.ones((32, 64, 3)), 169)
+    white = project_environment(Environment(np.ones((32, 64, 3), np.float32)), 169)
     environment = HarmonicEnvironment(compress_harmonics(sample), white)
     frames = turns(np.random.default_rng(5), 20)
     w_o = from_angles(np.linspace(0, 1.3, 20), np.linspace(0, 9, 20))
