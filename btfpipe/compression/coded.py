@@ -23,11 +23,18 @@ import numpy as np
 from btfpipe import store
 from btfpipe.compiled import leaf
 from btfpipe.compression.entropy import decode_planes, encode_planes
-from btfpipe.compression.model import Model, comparison_bytes, measured_error, tables
+from btfpipe.compression.model import (
+    Model,
+    comparison_bytes,
+    measured_error,
+    read_tables,
+    tables,
+)
 from btfpipe.compression.svd import SvdModel, factorise
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
 
 _TERMS = 256
@@ -83,15 +90,7 @@ class CodedModel(Model):
     @classmethod
     def from_arrays(cls, reader, source):
         about = reader.about
-        whole = [about.get("shape"), about.get("terms")]
-        if (
-            [isinstance(a, list) and len(a) for a in whole] != [2, 4]
-            or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
-            or not isinstance(about.get("step"), float)
-            or not 0 < about["step"] < math.inf
-        ):
-            raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
-        n = about["terms"][0]
+        _, (n, *_) = _sizes(reader)
         members = {
             "texture_code": reader.require("texture_code", (None,), "u"),
             "angular_code": reader.require("angular_code", (None,), "u"),
@@ -119,10 +118,39 @@ class CodedModel(Model):
     def texels(self, rows, cols):
         return values_of(self.texture_factors[rows, cols], self.angular_factors, self.colour)
 
+    @classmethod
+    def shading_needs(cls, reader):
+        from btfpipe.compression.coded_shading import MANY_LIGHTS
+        from btfpipe.sample.light_slices import slice_bytes
+
+        shape, terms = _sizes(reader)
+        source = read_tables(reader)
+        texture = 4 * math.prod(shape) * terms[0]
+        angular = 4 * len(source.light_index) * sum(terms[1:])
+        shared = (0, 0)
+        if "view_basis" in reader:
+            shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
+        # each is unpacked into one array and laid out anew in another
+        return ShadingNeeds(texture + angular, max(texture, angular), *shared)
+
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader
 
         return CodedShader(self, interpolation)
+
+
+def _sizes(reader):
+    """Rows and columns, and the numbers of terms, of a checked description."""
+    about = reader.about
+    whole = [about.get("shape"), about.get("terms")]
+    if (
+        [isinstance(a, list) and len(a) for a in whole] != [2, 4]
+        or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
+        or not isinstance(about.get("step"), float)
+        or not 0 < about["step"] < math.inf
+    ):
+        raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
+    return whole
 
 
 def values_of(texture, angular, colour):
@@ -414,6 +442,7 @@ def _unpack(members, source, about):
     texture = texture.astype(np.float32)
     texture *= (np.float32(about["step"]) / singular)[:, None, None]
     texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
+    texture = np.ascontiguousarray(texture.transpose(1, 2, 0))  # one copy at a time
     if "view_basis" in members:
         view, light = (
             np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light")
@@ -433,6 +462,4 @@ def _unpack(members, source, about):
             planes = view @ planes @ light.T
     planes = planes.reshape(len(planes), -1)
     parts = np.split(planes, np.cumsum(terms)[:-1])
-    return np.ascontiguousarray(texture.transpose(1, 2, 0)), [
-        np.ascontiguousarray(part.T) for part in parts
-    ]
+    return texture, [np.ascontiguousarray(part.T) for part in parts]
