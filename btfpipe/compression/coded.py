@@ -45,6 +45,12 @@ _SPARE = 1024  # bytes left for what the caller adds to the description
 _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
 _CLOSE = 0.01  # share of the wanted size by which a file may be smaller
 _MOST_TRIALS = 24
+_SEARCH = 1.25  # of the reading of all pictures, what the search for the step takes, as measured
+_TRANSFORMED, _PACKED = (
+    0.3,
+    0.85,
+)  # shares of the search that end with the transforms and with the last trial
+_TRIED = 5  # times the wanted size is what trials make in all, about
 _TEXELS = 1 << 11  # whose factors stay in the processor's cache for all colours
 _BLOCK = 1 << 14  # rows a matrix product, fixed
 _LARGEST = 1 << 24  # quantised coefficient: the precision of float32
@@ -201,7 +207,7 @@ def compress_coded(
     memory : int
         Bytes of private memory to stay within.
     on_progress : callable, optional
-        Called with (pictures read, pictures to read).
+        Called with (pictures read, pictures to read); the search for the step counts as some more of them.
 
     Returns
     -------
@@ -235,14 +241,17 @@ def compress_coded(
             f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
             f" {memory >> 20} MB. Raise it, or ask for fewer terms."
         )
-    n_pairs = sample.n_pairs
+    search = math.ceil(_SEARCH * sample.n_pairs)
     report = on_progress or (lambda done, total: None)
     reads = 0
 
     def first(done, total):
         nonlocal reads
         reads = total
-        report(done, total + n_pairs)
+        report(done, reads + search + sample.n_pairs)
+
+    def then(done):
+        report(reads + int(done), reads + search + sample.n_pairs)
 
     roots = _Roots(sample)
     texture, angular, facts = factorise(
@@ -253,12 +262,16 @@ def compress_coded(
         packer = _Packer(SvdModel(texture.reshape(*sample.shape, -1), angular, roots, facts))
         packer.source.mask = sample.mask
         del texture, angular
-        model = packer.fit(target_bytes, spare, threads)
+        then(_TRANSFORMED * search)
+        model = packer.fit(
+            target_bytes,
+            spare,
+            threads,
+            lambda share: then((_TRANSFORMED + (_PACKED - _TRANSFORMED) * share) * search),
+        )
+    then(search)
     model.about |= measured_error(
-        model,
-        sample,
-        threads=threads,
-        on_progress=lambda done, total: report(reads + done, reads + total),
+        model, sample, threads=threads, on_progress=lambda done, _: then(search + done)
     )
     return model
 
@@ -362,8 +375,8 @@ class _Packer:
         members["texture_code"], members["angular_code"] = ordered_map(encode_planes, jobs, threads)
         return members, {"shape": list(self.source.shape), "step": step, "terms": terms}
 
-    def fit(self, target, spare=0, threads=1):
-        """The Model whose file is as large as `target` allows, with some bytes to spare."""
+    def fit(self, target, spare=0, threads=1, on_progress=None):
+        """The Model whose file is as large as `target` allows, with some bytes to spare; tells its share of the trials done."""
         largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
         tiny = float(np.finfo(np.float32).tiny)
         if largest < tiny:  # single precision has no step for these
@@ -373,6 +386,8 @@ class _Packer:
         def attempt(step):
             members, about = self.pack(step, threads)
             sizes[step] = _file_bytes(members, self.source, about) + spare
+            if on_progress is not None:  # a trial takes the longer the more it makes
+                on_progress(min(1.0, sum(sizes.values()) / (_TRIED * target)))
             return sizes[step] <= target, members, about
 
         coarse = 2 * largest or 1.0  # all coefficients are 0
