@@ -1,7 +1,7 @@
 """What a render takes of private memory, counted from shapes before the work.
 
 Mapped files are not private: the system takes their pages back when it wants to. The constants were measured (RssAnon)
-and err on the safe side.
+and err on the safe side. Compiling, which only the first render of an installation does, takes some 50 MB more.
 """
 
 import math
