@@ -128,7 +128,7 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
         raise click.UsageError("--resample is for a database of several samples; 1 is given.")
     opened = [Sample.open(path) for path in samples]
     names = _names(samples) if len(samples) > 1 else None
-    with naming(samples[0]), progress("compress: pictures read", quiet) as report:
+    with naming(samples[0]), progress("compress: pictures", quiet) as report:
         model = compress_samples(
             opened,
             method,

@@ -89,7 +89,8 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     with progress("render", quiet) as report:
         picture = render_scene(loaded, seed=seed, threads=loaded.threads, on_progress=report)
     render_seconds = time.perf_counter() - start
-    largest = float(np.abs(picture[..., :3]).max())
+    colour = picture[..., :3]
+    largest = float(max(colour.max(), -colour.min()))  # no copy: a film may be large
     if not np.isfinite(largest):
         raise InputError(f"{scene}: radiance exceeds 32-bit floats; lower the power of its lights.")
     warnings, short = [], "RGBAN"

@@ -85,15 +85,26 @@ def open_appearance(path, material=None):
     InputError
         If the file is neither, is damaged, or a material is asked for that it does not hold.
     """
+    reader, kind = _read(path)
+    return choose_material(kind.from_reader(reader), material, path)
+
+
+def shading_needs(path):
+    """What shading from a Sample or a Model will take, told before it is opened; see `Appearance.shading_needs`."""
+    reader, kind = _read(path)
+    return kind.shading_needs(reader)
+
+
+def _read(path):
+    """Reader of a Sample or a Model, and its class."""
     reader = store.read(path, ("sample", "model"))
     if reader.kind == "sample":
-        return choose_material(Sample.from_reader(reader), material, path)
+        return reader, Sample
     name = reader.about.get("method")
     if name not in METHODS:
         raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
     method = METHODS[name]
-    model = getattr(importlib.import_module(method.module), method.model).from_reader(reader)
-    return choose_material(model, material, path)
+    return reader, getattr(importlib.import_module(method.module), method.model)
 
 
 def choose_material(appearance, material, path):
@@ -167,4 +178,5 @@ __all__ = [
     "compress",
     "no_database",
     "open_appearance",
+    "shading_needs",
 ]

@@ -23,11 +23,18 @@ import numpy as np
 from btfpipe import store
 from btfpipe.compiled import leaf
 from btfpipe.compression.entropy import decode_planes, encode_planes
-from btfpipe.compression.model import Model, comparison_bytes, measured_error, tables
+from btfpipe.compression.model import (
+    Model,
+    comparison_bytes,
+    measured_error,
+    read_tables,
+    tables,
+)
 from btfpipe.compression.svd import SvdModel, factorise
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
 
 _TERMS = 256
@@ -38,6 +45,12 @@ _SPARE = 1024  # bytes left for what the caller adds to the description
 _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samples
 _CLOSE = 0.01  # share of the wanted size by which a file may be smaller
 _MOST_TRIALS = 24
+_SEARCH = 1.25  # of the reading of all pictures, what the search for the step takes, as measured
+_TRANSFORMED, _PACKED = (
+    0.3,
+    0.85,
+)  # shares of the search that end with the transforms and with the last trial
+_TRIED = 5  # times the wanted size is what trials make in all, about
 _TEXELS = 1 << 11  # whose factors stay in the processor's cache for all colours
 _BLOCK = 1 << 14  # rows a matrix product, fixed
 _LARGEST = 1 << 24  # quantised coefficient: the precision of float32
@@ -83,15 +96,7 @@ class CodedModel(Model):
     @classmethod
     def from_arrays(cls, reader, source):
         about = reader.about
-        whole = [about.get("shape"), about.get("terms")]
-        if (
-            [isinstance(a, list) and len(a) for a in whole] != [2, 4]
-            or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
-            or not isinstance(about.get("step"), float)
-            or not 0 < about["step"] < math.inf
-        ):
-            raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
-        n = about["terms"][0]
+        _, (n, *_) = _sizes(reader)
         members = {
             "texture_code": reader.require("texture_code", (None,), "u"),
             "angular_code": reader.require("angular_code", (None,), "u"),
@@ -119,10 +124,39 @@ class CodedModel(Model):
     def texels(self, rows, cols):
         return values_of(self.texture_factors[rows, cols], self.angular_factors, self.colour)
 
+    @classmethod
+    def shading_needs(cls, reader):
+        from btfpipe.compression.coded_shading import MANY_LIGHTS
+        from btfpipe.sample.light_slices import slice_bytes
+
+        shape, terms = _sizes(reader)
+        source = read_tables(reader)
+        texture = 4 * math.prod(shape) * terms[0]
+        angular = 4 * len(source.light_index) * sum(terms[1:])
+        shared = (0, 0)
+        if "view_basis" in reader:
+            shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
+        # each is unpacked into one array and laid out anew in another
+        return ShadingNeeds(texture + angular, max(texture, angular), *shared)
+
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader
 
         return CodedShader(self, interpolation)
+
+
+def _sizes(reader):
+    """Rows and columns, and the numbers of terms, of a checked description."""
+    about = reader.about
+    whole = [about.get("shape"), about.get("terms")]
+    if (
+        [isinstance(a, list) and len(a) for a in whole] != [2, 4]
+        or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
+        or not isinstance(about.get("step"), float)
+        or not 0 < about["step"] < math.inf
+    ):
+        raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
+    return whole
 
 
 def values_of(texture, angular, colour):
@@ -173,7 +207,7 @@ def compress_coded(
     memory : int
         Bytes of private memory to stay within.
     on_progress : callable, optional
-        Called with (pictures read, pictures to read).
+        Called with (pictures read, pictures to read); the search for the step counts as some more of them.
 
     Returns
     -------
@@ -207,14 +241,17 @@ def compress_coded(
             f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
             f" {memory >> 20} MB. Raise it, or ask for fewer terms."
         )
-    n_pairs = sample.n_pairs
+    search = math.ceil(_SEARCH * sample.n_pairs)
     report = on_progress or (lambda done, total: None)
     reads = 0
 
     def first(done, total):
         nonlocal reads
         reads = total
-        report(done, total + n_pairs)
+        report(done, reads + search + sample.n_pairs)
+
+    def then(done):
+        report(reads + int(done), reads + search + sample.n_pairs)
 
     roots = _Roots(sample)
     texture, angular, facts = factorise(
@@ -225,12 +262,16 @@ def compress_coded(
         packer = _Packer(SvdModel(texture.reshape(*sample.shape, -1), angular, roots, facts))
         packer.source.mask = sample.mask
         del texture, angular
-        model = packer.fit(target_bytes, spare, threads)
+        then(_TRANSFORMED * search)
+        model = packer.fit(
+            target_bytes,
+            spare,
+            threads,
+            lambda share: then((_TRANSFORMED + (_PACKED - _TRANSFORMED) * share) * search),
+        )
+    then(search)
     model.about |= measured_error(
-        model,
-        sample,
-        threads=threads,
-        on_progress=lambda done, total: report(reads + done, reads + total),
+        model, sample, threads=threads, on_progress=lambda done, _: then(search + done)
     )
     return model
 
@@ -334,8 +375,8 @@ class _Packer:
         members["texture_code"], members["angular_code"] = ordered_map(encode_planes, jobs, threads)
         return members, {"shape": list(self.source.shape), "step": step, "terms": terms}
 
-    def fit(self, target, spare=0, threads=1):
-        """The Model whose file is as large as `target` allows, with some bytes to spare."""
+    def fit(self, target, spare=0, threads=1, on_progress=None):
+        """The Model whose file is as large as `target` allows, with some bytes to spare; tells its share of the trials done."""
         largest = max(float(np.abs(self.texture).max()), float(np.abs(self.angular).max()))
         tiny = float(np.finfo(np.float32).tiny)
         if largest < tiny:  # single precision has no step for these
@@ -345,6 +386,8 @@ class _Packer:
         def attempt(step):
             members, about = self.pack(step, threads)
             sizes[step] = _file_bytes(members, self.source, about) + spare
+            if on_progress is not None:  # a trial takes the longer the more it makes
+                on_progress(min(1.0, sum(sizes.values()) / (_TRIED * target)))
             return sizes[step] <= target, members, about
 
         coarse = 2 * largest or 1.0  # all coefficients are 0
@@ -414,6 +457,7 @@ def _unpack(members, source, about):
     texture = texture.astype(np.float32)
     texture *= (np.float32(about["step"]) / singular)[:, None, None]
     texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
+    texture = np.ascontiguousarray(texture.transpose(1, 2, 0))  # one copy at a time
     if "view_basis" in members:
         view, light = (
             np.asarray(members[f"{name}_basis"], np.float32) for name in ("view", "light")
@@ -433,6 +477,4 @@ def _unpack(members, source, about):
             planes = view @ planes @ light.T
     planes = planes.reshape(len(planes), -1)
     parts = np.split(planes, np.cumsum(terms)[:-1])
-    return np.ascontiguousarray(texture.transpose(1, 2, 0)), [
-        np.ascontiguousarray(part.T) for part in parts
-    ]
+    return texture, [np.ascontiguousarray(part.T) for part in parts]

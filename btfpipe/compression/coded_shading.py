@@ -4,10 +4,10 @@ import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.coded import values_of
-from btfpipe.sample.light_slices import LightSlices
+from btfpipe.sample.light_slices import LightSlices, slice_bytes
 from btfpipe.sample.shading import PairShader, corners
 
-_MANY_LIGHTS = 4  # as measured, at 1 to 4 pixels a texel
+MANY_LIGHTS = 4  # as measured, at 1 to 4 pixels a texel
 
 
 class CodedShader(PairShader):
@@ -29,8 +29,8 @@ class CodedShader(PairShader):
         self.angular = model.angular_factors
         self.colour = model.colour
         if self.pairs.near is None:
-            self.many_lights = _MANY_LIGHTS
-            self.slice_bytes = 12 * len(self.pairs.inverse_cosines)
+            self.many_lights = MANY_LIGHTS
+            self.slice_bytes = slice_bytes(len(self.pairs.inverse_cosines))
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""

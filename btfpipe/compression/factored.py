@@ -12,6 +12,7 @@ from btfpipe.compiled import leaf
 from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise, left_out, pictures_to_read, planar_pictures
 from btfpipe.errors import InputError
+from btfpipe.sample.appearance import ShadingNeeds
 
 EPSILON = 1e-5  # added inside logarithms by the ``.btf`` formats
 _MOST_CHROMA = 4.0  # of |U| / Y and |V| / Y; colours without negative channels stay below 3.83
@@ -193,6 +194,15 @@ class FactoredModel(Model):
         if self.pair_factor is not None:
             out *= self.pair_factor[None, :, None]
         return out
+
+    @classmethod
+    def shading_needs(cls, reader):
+        factors = []
+        for c in range(3):
+            name = f"texture_{c}" if f"texture_{c}" in reader else "texture_0"
+            factors.append(reader.require(name, (None,) * 3, "f", finite=False))
+            factors.append(reader.require(f"angular_{c}", (None,) * 2, "f", finite=False))
+        return ShadingNeeds(4 * sum(f.size for f in factors), max(f.size for f in factors))
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.factored_shading import FactoredShader

@@ -26,6 +26,7 @@ from btfpipe.compression.model import Model, measured_error, require_summable, s
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
 
 _COLS = 32  # texels of a scan line worked on together; fixed, so that memory and threads never show
@@ -153,6 +154,13 @@ class HarmonicsModel(Model):
         flat = features.reshape(-1, features.shape[2])
         axes = np.linalg.eigh(flat.T @ flat)[1][:, ::-1]
         return features @ axes[:, :n]
+
+    @classmethod
+    def shading_needs(cls, reader):
+        from btfpipe.compression.harmonics_shading import MANY_LIGHTS, slice_bytes
+
+        codes = reader.require("codes", (None,) * 5, "u")  # stay mapped
+        return ShadingNeeds(slice_bytes=slice_bytes(codes.shape[4]), many_lights=MANY_LIGHTS)
 
     def shader(self, interpolation="barycentric"):
         """As `Appearance.shader`, but straight from the harmonics: `interpolation` changes nothing."""

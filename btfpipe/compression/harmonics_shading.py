@@ -13,6 +13,7 @@ from btfpipe.directions.spherical_harmonics import (
 from btfpipe.sample.shading import corners
 
 FAST = {"contract", "reassoc", "nsz"}
+MANY_LIGHTS = 2
 
 
 class HarmonicsShader:
@@ -23,7 +24,7 @@ class HarmonicsShader:
     model : HarmonicsModel
     """
 
-    many_lights = 2
+    many_lights = MANY_LIGHTS
 
     def __init__(self, model):
         self.rows, self.cols = model.shape
@@ -34,7 +35,7 @@ class HarmonicsShader:
         self.codes = np.asarray(model.coefficient_codes).reshape(-1, 3, all_terms)
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
-        self.slice_bytes = 12 * model.light_terms
+        self.slice_bytes = slice_bytes(model.light_terms)
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -46,6 +47,11 @@ class HarmonicsShader:
     def slices(self, row, col, w_o):
         """See `Appearance.shader`."""
         return HarmonicSlices(self, row, col, w_o)
+
+
+def slice_bytes(light_terms):
+    """Bytes of a look-up in `HarmonicSlices`."""
+    return 12 * light_terms
 
 
 class HarmonicSlices:

@@ -24,6 +24,7 @@ from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.resample import Resampled
 
 # Of the pictures' 3 bytes a texel and pair, by default one in so many is spent: with 8 components in half precision
@@ -190,6 +191,13 @@ class LocalPcaModel(Model):
             basis = self.bases_of(cluster)
             out[own] = np.tensordot(coordinates[own], basis[..., 1:], (1, 2)) + basis[..., 0]
         return out
+
+    @classmethod
+    def shading_needs(cls, reader):
+        bases = reader.require("bases", (None,) * 4, "fi", finite=False)
+        coordinates = reader.require("coordinates", (None,) * 2, "f", finite=False)
+        kept = 4 * (bases.size + coordinates.size + len(coordinates))
+        return ShadingNeeds(kept, bases.size)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.local_shading import LocalPcaShader

@@ -18,6 +18,7 @@ from numba import njit
 from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
 
 _OVERSAMPLING = 10
@@ -81,6 +82,14 @@ class SvdModel(Model):
         texture = np.asarray(self.texture_factors[rows, cols], np.float32)
         angular = np.asarray(self.angular_factors, np.float32).reshape(-1, self.n_terms)
         return (texture @ angular.T).reshape(len(texture), -1, 3)
+
+    @classmethod
+    def shading_needs(cls, reader):
+        names = ("texture_factors", "angular_factors")
+        factors = [reader.require(name, (None,) * 3, "f", finite=False) for name in names]
+        # single precision stays mapped
+        kept = sum(4 * f.size for f in factors if f.dtype != np.float32)
+        return ShadingNeeds(kept, max(f.size for f in factors))
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.svd_shading import SvdShader

@@ -22,6 +22,7 @@ from btfpipe.compression.model import (
 from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
+from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.shading import PairShader, corners
 
 _DECODED_BYTES = 6 << 20  # of a view's pictures at a time; fixed, as sums hang on it
@@ -96,6 +97,15 @@ class ViewPcaModel(Model):
         terms = np.concatenate([means, terms], axis=1)
         values = np.asarray(self.weights) @ terms.reshape(*terms.shape[:2], -1)
         return np.ascontiguousarray(values.reshape(self.n_pairs, -1, 3).swapaxes(0, 1))
+
+    @classmethod
+    def shading_needs(cls, reader):
+        means = reader.require("means", (None,) * 4, "f", finite=False)
+        textures = reader.require("textures", (None,) * 5, "fi", finite=False)
+        weights = reader.require("weights", (None,) * 3, "f", finite=False)
+        kept = 4 * (means.size + textures.size + weights.size)
+        # while values are checked, then a view in single precision
+        return ShadingNeeds(kept, max(textures.size, 2 * kept // max(len(means), 1)))
 
     def shader(self, interpolation="barycentric"):
         return ViewPcaShader(self, interpolation)

@@ -4,6 +4,7 @@ Arrays are (rows, cols, channels), row 0 at the top. Colours are left as stored:
 multiplied in.
 """
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -272,6 +273,13 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
     half : bool or list of bool
         Store 16-bit floats where the format can; a list says so channel by channel (EXR).
     """
+    with _encoded(picture, suffix, quality, names, half) as path:
+        return path.read_bytes()
+
+
+@contextlib.contextmanager
+def _encoded(picture, suffix, quality=95, names=None, half=False):
+    """A temporary file of what `encode_picture` gives, in memory where the system has files there."""
     import OpenImageIO as oiio
 
     picture = np.ascontiguousarray(picture)
@@ -310,11 +318,15 @@ def encode_picture(picture, suffix, quality=95, names=None, half=False):
         path = Path(folder) / ("picture" + suffix)
         if not out.open(str(path), spec) or not out.write_image(picture) or not out.close():
             raise InputError(f"picture{suffix}: cannot be written ({_first_line(out.geterror())}).")
-        return path.read_bytes()
+        yield path
 
 
 def write_picture(path, picture, **options):
     """Write a picture, whole or not at all; see `encode_picture`."""
-    data = encode_picture(picture, Path(path).suffix.lower(), **options)
-    with store.whole(path) as file:
-        file.write(data)
+    # not by the library itself, which takes a full disk in silence for some formats
+    with (
+        _encoded(picture, Path(path).suffix.lower(), **options) as encoded,
+        store.whole(path) as file,
+    ):
+        with encoded.open("rb") as data:
+            shutil.copyfileobj(data, file, 1 << 20)

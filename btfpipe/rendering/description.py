@@ -1,5 +1,6 @@
 """Reading the scene's YAML: a closed schema, errors that name the key, files filled in."""
 
+import contextlib
 from importlib import resources
 from pathlib import Path
 
@@ -52,6 +53,15 @@ def read_description(path, bindings=None):
     if unused:
         raise InputError(f"{path}: no file is named ${sorted(unused)[0]}, which --bind gives.")
     return scene
+
+
+@contextlib.contextmanager
+def naming_entry(part, number):
+    """Say in front of what is wrong inside the block which of the scene's lights or objects it is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{part}[{number}]: {error}") from error
 
 
 def _file(scene, where, value, bindings):

@@ -17,6 +17,7 @@ from btfpipe.hashing import uniform
 METHODS = ("q2tree", "median-cut", "alias")
 PROJECTIONS = ("latlong", "probe")
 PIXEL_BYTES = 210  # of a map while it is made into lights, as measured
+KEPT_PIXEL_BYTES = 16  # and from then on
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 _DEPTH = 16  # levels of the quadtree, far finer than any map's pixels
 _QUADS = 12

@@ -145,9 +145,17 @@ def dress(vertices, faces, normals, tangents, coordinates, appearance, interpola
             float(coordinates.texels_per_unit), rows, cols, appearance.toroidal, coherent[layer],
         )  # fmt: skip
     return Dressing(
-        row, col, weight, axis, coherent, appearance.shader(interpolation), rows, cols,
+        row, col, weight, axis, coherent, _shader(appearance, interpolation), rows, cols,
         bool(appearance.toroidal), appearance,
     )  # fmt: skip
+
+
+def _shader(appearance, interpolation):
+    """An appearance's shader, kept with it: objects of one Model share what it holds."""
+    made = vars(appearance).setdefault("_shaders", {})
+    if interpolation not in made:
+        made[interpolation] = appearance.shader(interpolation)
+    return made[interpolation]
 
 
 def plane_frame(plane):
@@ -265,6 +273,13 @@ def patch(
     return Thing(vertices, faces, normals, dressing)
 
 
+def patch_vertices(entry, cols):
+    """About how many vertices `patch` will have for an entry of a scene with a map of so many columns, at least 4."""
+    width, height = entry["plane"]["size"]
+    scale = entry.get("texels_per_unit") or cols * entry.get("repeats", 1) / width
+    return int((width * scale + 2) * (height * scale + 2))
+
+
 def transformed(thing, transform):
     """The same Thing scaled, turned and shifted; changes `thing` and returns it."""
     if not transform:
@@ -327,8 +342,8 @@ def winding_number(vertices, faces, x, y, z):
     return total / (2 * np.pi)
 
 
-def diffuse_mesh(path, albedo, read_mesh):
-    """A diffuse object from a Surface file or, through `read_mesh`, from a foreign mesh."""
+def open_mesh(path, read_mesh):
+    """Vertices, faces and normals of a Surface file or, through `read_mesh`, of a foreign mesh."""
     with open(path, "rb") as file:
         ours = file.read(2) == b"PK"
     if ours:
@@ -349,4 +364,9 @@ def diffuse_mesh(path, albedo, read_mesh):
         across = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
         normals = np.repeat(across, 3, axis=0).astype(np.float32)
+    return vertices, faces, normals
+
+
+def diffuse_mesh(vertices, faces, normals, albedo):
+    """A diffuse object of what `open_mesh` gives."""
     return Thing(vertices, faces, normals, albedo=np.array(albedo, np.float32), solid=True)

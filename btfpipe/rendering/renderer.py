@@ -10,19 +10,13 @@ from btfpipe.rendering.clearance import clearance
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
 _RAYS = 1 << 16
-_RAY_BYTES = 600  # origin, direction, hit, point, light, look-ups
+_RAY_BYTES = 600  # about what a ray takes, for tiles of like size in memory; fixed, too
 
 
 def tile_side(samples, slice_bytes=0):
     """Pixels along a tile's side at this many rays a pixel; smaller if a ray's look-up keeps so many bytes of a slice."""
     rays = _RAYS * _RAY_BYTES / (_RAY_BYTES + slice_bytes)
     return min(max(int(np.sqrt(rays / samples)), 8), 256)
-
-
-def tile_bytes(film):
-    """Most bytes that a thread holds for the rays of one tile, over surfaces of one layer."""
-    side = tile_side(film.samples)
-    return min(side, film.width) * min(side, film.height) * film.samples * _RAY_BYTES
 
 
 def _is_sliced(thing, lights):

@@ -1,6 +1,5 @@
 """The Scene: camera, film, lights and objects, loaded and checked against each other."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,10 +8,9 @@ from btfpipe.compression import choose_material, open_appearance
 from btfpipe.errors import InputError
 from btfpipe.rendering import objects
 from btfpipe.rendering.camera import FILTER_RADIUS, Camera, make_camera
-from btfpipe.rendering.description import read_description
-from btfpipe.rendering.environment import PIXEL_BYTES, Environment
-from btfpipe.rendering.renderer import tile_bytes
-from btfpipe.sample import Sample
+from btfpipe.rendering.description import naming_entry, read_description
+from btfpipe.rendering.environment import Environment
+from btfpipe.rendering.memory import parts_of_scene, plan_threads
 
 
 @dataclass
@@ -97,8 +95,7 @@ def load_scene(
     read_picture : callable, optional
         Path to (rows, cols, 3) colours of a picture file, for environment maps.
     memory : int, optional
-        Bytes that an environment map in work may take, and those that the copies of Samples to shade from and the tiles in work
-        may.
+        Bytes of private memory to stay within; by default nothing is counted.
     threads : int
         That will render, unless the memory is for fewer; each works on a tile.
     seed : int
@@ -111,7 +108,7 @@ def load_scene(
     Raises
     ------
     InputError
-        As `read_description`; if files do not belong together; if a tile, Samples or a map take more than `memory`; if the
+        As `read_description`; if files do not belong together; if rendering takes more than `memory`; if the
         camera is inside an object.
     """
     description = read_description(path, bindings)
@@ -119,26 +116,28 @@ def load_scene(
     settings.setdefault("filter", "gaussian")
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
-    tile = tile_bytes(film)
+    opened = {}
+
+    def once(opener, *arguments):
+        key = (opener, *arguments)
+        if key not in opened:
+            opened[key] = opener(*arguments)
+        return opened[key]
+
     try:
-        if memory is not None and tile > memory:
-            raise InputError(
-                f"the rays of a tile of pixels take {_size(tile)}; --memory allows {_size(memory)}. Pass --memory"
-                f" {math.ceil(tile / 2**20)}M."
-            )
-        threads = threads if memory is None else min(threads, memory // tile)
+        if memory is not None:
+            parts = parts_of_scene(description, film, once, read_mesh, read_picture)
+            threads = plan_threads(*parts, threads, memory)
         lights, environments, skies = [], [], {}
-        opened, things, grounds, files = {}, [], [], []
+        things, grounds, files = [], [], []
         for number, light in enumerate(description["lights"]):
             if light["type"] == "environment":
                 files.append(light["map"])
-                try:
-                    environment = _environment(light, read_picture, memory)
+                with naming_entry("lights", number):
+                    environment = _environment(light, read_picture, opened)
                     lights += _stand_for(environment, len(environments), light, seed)
                     if light.get("method") == "harmonics":
                         skies[number] = len(environments), environment, light
-                except InputError as error:
-                    raise InputError(f"lights[{number}]: {error}") from error
                 environments.append(environment)
                 if environment.visible and "background" in description:
                     raise InputError(
@@ -147,22 +146,17 @@ def load_scene(
                     )
             else:
                 lights.append(_light(number, light))
-        room = None if memory is None else (memory, threads * tile)
         for number, entry in enumerate(description["objects"]):
             files += [entry[key] for key in ("surface", "map", "model", "mesh") if key in entry]
             if "ground" in entry:
                 grounds.append(entry)
                 continue
-            try:
-                thing = _thing(entry, opened, read_mesh, room)
+            with naming_entry("objects", number):
+                thing = _thing(entry, once, read_mesh)
                 things.append(objects.transformed(thing, entry.get("transform")))
-            except InputError as error:
-                raise InputError(f"objects[{number}]: {error}") from error
         for number, sky in skies.items():
-            try:
+            with naming_entry("lights", number):
                 _add_sky(things, *sky)
-            except InputError as error:
-                raise InputError(f"lights[{number}]: {error}") from error
         dressed = [t for t in things if t.dressing is not None] or things
         if not dressed:
             raise InputError("objects: a ground needs something to lie below; add an object.")
@@ -196,17 +190,13 @@ def _light(number, light):
     return Light(True, direction / length, np.array(light["irradiance"], float))
 
 
-def _environment(light, read_picture, memory):
+def _environment(light, read_picture, opened):
     if read_picture is None:
         raise InputError(f"{light['map']}: no reader of pictures at hand; pass load_scene one.")
-    picture = read_picture(light["map"])
-    rows, cols = picture.shape[:2]
-    need = PIXEL_BYTES * rows * cols
-    if memory is not None and need > memory:
-        raise InputError(
-            f"{light['map']}: {cols} x {rows} pixels take {_size(need)} while they are made into lights; --memory"
-            f" allows {_size(memory)}. Pass --memory {math.ceil(need / 2**30)}G, or a smaller map."
-        )
+    # the Environment keeps one of its own
+    picture = opened.pop((read_picture, light["map"]), None)
+    if picture is None:
+        picture = read_picture(light["map"])
     return Environment(
         picture,
         light.get("projection"),
@@ -246,44 +236,20 @@ def _add_sky(things, number, environment, light):
         dressing.skies[number] = sky
 
 
-def _require_room(path, opened, room):
-    """Refuse the Samples opened so far if the copies that shading keeps of them exceed the memory."""
-    samples = sum(s.codes.nbytes for s in opened.values() if isinstance(s, Sample))
-    memory, tiles = room
-    if samples and samples + tiles > memory:
-        raise InputError(
-            f"{path}: shading from a sample keeps a copy of it in memory; with the tiles in work that makes"
-            f" {_size(samples + tiles)} of the {_size(memory)} that --memory allows. Pass --memory"
-            f" {math.ceil((samples + tiles) / 2**30)}G, or a Model in its place: `btfpipe compress` makes one that"
-            " takes far less."
-        )
+def _material(once, entry):
+    appearance = once(open_appearance, entry["model"])
+    return once(choose_material, appearance, entry.get("material"), entry["model"])
 
 
-def _material(appearance, entry):
-    return choose_material(appearance, entry.get("material"), entry["model"])
-
-
-def _size(count):
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
-
-
-def _thing(entry, opened, read_mesh, room):
+def _thing(entry, once, read_mesh):
     """Load one object; Models, Surfaces and their shaders are opened once."""
     from btfpipe.surface import Surface
     from btfpipe.synthesis import CoordinateMap
 
-    def open_once(opener, file):
-        key = (opener, file)
-        if key not in opened:
-            opened[key] = opener(file)
-            if room is not None:
-                _require_room(file, opened, room)
-        return opened[key]
-
     interpolation = entry.get("interpolation", "barycentric")
     if "surface" in entry:
-        surface = open_once(Surface.open, entry["surface"])
-        coordinates = open_once(CoordinateMap.open, entry["map"])
+        surface = once(Surface.open, entry["surface"])
+        coordinates = once(CoordinateMap.open, entry["map"])
         belongs = coordinates.domain.get("surface")
         if belongs is None:
             raise InputError(f"{entry['map']}: a map over a plane; this object is a surface.")
@@ -292,19 +258,19 @@ def _thing(entry, opened, read_mesh, room):
                 f"{entry['map']}: made for surface {belongs}; {entry['surface']} is {surface.digest}. Run"
                 " `btfpipe synthesize` on this surface, or name the other."
             )
-        appearance = _material(open_once(open_appearance, entry["model"]), entry)
+        appearance = _material(once, entry)
         return objects.dressed_surface(
             surface.levels[0], coordinates, appearance, interpolation, entry["map"]
         )
     if "plane" in entry and "model" in entry:
         coordinates = None
         if "map" in entry:
-            coordinates = open_once(CoordinateMap.open, entry["map"])
+            coordinates = once(CoordinateMap.open, entry["map"])
             if "plane" not in coordinates.domain:
                 raise InputError(f"{entry['map']}: a map over a surface; this object is a plane.")
         return objects.patch(
             entry["plane"],
-            _material(open_once(open_appearance, entry["model"]), entry),
+            _material(once, entry),
             interpolation,
             coordinates=coordinates,
             texels_per_unit=entry.get("texels_per_unit"),
@@ -313,7 +279,8 @@ def _thing(entry, opened, read_mesh, room):
         )
     if "plane" in entry:
         return objects.flat(entry["plane"], entry["albedo"])
-    return objects.diffuse_mesh(entry["mesh"], entry["albedo"], read_mesh)
+    mesh = once(objects.open_mesh, entry["mesh"], read_mesh)
+    return objects.diffuse_mesh(*mesh, entry["albedo"])
 
 
 def _ground(entry, points, up):

@@ -4,9 +4,17 @@ Every stage takes either; a new compression is one module with a class that deri
 and fills in `pictures`, `texels`, `shader` and `nbytes`.
 """
 
+from collections import namedtuple
+
 import numpy as np
 
 from btfpipe.errors import InputError
+
+# Private bytes of shading: kept by the shader with what it stands on, further ones while that is opened and made, and those of
+# a look-up's slice from so many lights on (see `Appearance.shader`). And what would take less, if there is something.
+ShadingNeeds = namedtuple(
+    "ShadingNeeds", "kept loading slice_bytes many_lights instead", defaults=(0, 0, 0, 0, "")
+)
 
 
 def light_cosines(light_directions):
@@ -81,6 +89,21 @@ class Appearance:
         ``slice_bytes`` a look-up and is faster from ``many_lights`` lights on. Call it with BLAS on one thread.
         """
         raise NotImplementedError
+
+    @classmethod
+    def shading_needs(cls, reader):
+        """Memory that shading from a file takes, told by the shapes in it, before it is opened as one of these.
+
+        Parameters
+        ----------
+        reader : store.Reader
+            Its arrays are mapped, and what is used as it is mapped does not count.
+
+        Returns
+        -------
+        ShadingNeeds
+        """
+        return ShadingNeeds()
 
     @property
     def nbytes(self):

@@ -71,6 +71,11 @@ class LightSlices:
         _interpolate(self.values, chosen, light, share, w_i, out)
 
 
+def slice_bytes(lights):
+    """Bytes of a look-up in `LightSlices`."""
+    return 12 * lights
+
+
 @leaf
 def _all_corners(row, col, rows, cols, toroidal, texel, bilinear):
     for q in range(len(row)):

@@ -4,7 +4,7 @@ import numpy as np
 
 from btfpipe import store
 from btfpipe.errors import InputError
-from btfpipe.sample.appearance import Appearance
+from btfpipe.sample.appearance import Appearance, ShadingNeeds
 from btfpipe.sample.transfer import TRANSFERS, decode, decode_table
 
 
@@ -164,6 +164,14 @@ class Sample(Appearance):
         from btfpipe.sample.shading import RawShader
 
         return RawShader(self, interpolation)
+
+    @classmethod
+    def shading_needs(cls, reader):
+        codes = reader.require("pictures", (None,) * 4, finite=False)
+        return ShadingNeeds(
+            codes.nbytes,
+            instead="a Model in the sample's place: `btfpipe compress` makes one that takes far less",
+        )
 
     @property
     def nbytes(self):

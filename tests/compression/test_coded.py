@@ -8,7 +8,7 @@ import pytest
 from scipy.fft import idct
 
 from btfpipe.analysis.textons import eigen_textures
-from btfpipe.compression import open_appearance
+from btfpipe.compression import coded, open_appearance
 from btfpipe.compression.coded import CodedModel, compress_coded
 from btfpipe.compression.entropy import decode_planes
 from btfpipe.compression.svd import compress_svd
@@ -284,9 +284,21 @@ def test_a_budget_too_small_is_refused_with_the_need(make_sample):
         compress_coded(make_sample(), 5, n_terms=4, memory=32 << 20)
 
 
-def test_progress_ends_at_its_total(make_sample):
-    seen = []
+def test_progress_ends_at_its_total_and_moves_with_every_trial_of_a_step(make_sample, monkeypatch):
+    seen, pack = [], coded._Packer.pack
+
+    def packed(*args):
+        seen.append("trial")
+        return pack(*args)
+
+    monkeypatch.setattr(coded._Packer, "pack", packed)
     compress_coded(make_sample(), 5, on_progress=lambda done, total: seen.append((done, total)))
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-    assert len({total for _, total in seen}) == 1
-    assert seen[-1][0] == seen[-1][1]
+    told = [report for report in seen if report != "trial"]
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert len({total for _, total in told}) == 1
+    assert told[-1][0] == told[-1][1]
+    assert seen.count("trial") > 3
+    assert all(seen[i + 1] != "trial" for i, report in enumerate(seen) if report == "trial")
+    # the last trials, which take long, are told apart
+    last = [i for i, report in enumerate(seen) if report == "trial"][-2:]
+    assert seen[last[0] - 1][0] < seen[last[0] + 1][0] < seen[last[1] + 1][0] < told[-1][0]

@@ -556,14 +556,6 @@ def test_picture_of_codes_is_no_environment(scene_file, btfpipe, tmp_path):
     assert "room.png: a picture of uint8 codes; expected radiance in floating point" in done.stderr
 
 
-def test_map_too_large_for_the_memory_is_refused(scene_file, btfpipe, tmp_path):
-    write_picture(tmp_path / "room.exr", np.ones((128, 256, 3), np.float32))
-    path = scene_file([WHITE], lights=[{"type": "environment", "map": "room.exr"}])
-    done = btfpipe("render", path, "-o", tmp_path / "p.exr", "--memory", "6M", code=3)
-    assert "room.exr: 256 x 128 pixels take 7 MiB while they are made into lights" in done.stderr
-    btfpipe("render", path, "-o", tmp_path / "p.exr", "--memory", "7M")
-
-
 def test_visible_map_and_background_contradict(lit):
     with pytest.raises(InputError, match=r"background: lights\[0\] shows its map there"):
         lit([WHITE], np.ones((4, 8, 3)), background=[1, 1, 1])

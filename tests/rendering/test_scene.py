@@ -205,46 +205,6 @@ def test_more_texels_than_can_be_held_are_refused(
         load_scene(scene_file([{"plane": PLANE, "model": "m.sample.npz"} | changes]))
 
 
-def test_sample_whose_copy_exceeds_the_memory_is_refused_and_its_model_is_not(
-    make_sample, scene_file, btfpipe, tmp_path
-):
-    from btfpipe.compression.svd import compress_svd
-
-    sample = make_sample(rows=64, cols=64)  # 7 views x 19 lights x 4096 texels x 12 bytes: 6.2 MiB
-    sample.save(tmp_path / "m.sample.npz")
-    compress_svd(sample, 4).save(tmp_path / "m.model.npz")
-    path = scene_file([{"plane": PLANE, "model": "$model"}])
-    command = ["render", path, "-o", tmp_path / "p.exr", "--force", "--threads", 1]
-    tiles = 64 * 64 * 600 / 2**20  # 2.3 MiB: all pixels
-    for memory, model, code in (
-        (tiles + 6, "m.sample.npz", 3),
-        (tiles + 7, "m.sample.npz", 0),
-        (tiles + 6, "m.model.npz", 0),
-    ):
-        done = btfpipe(
-            *command, "--memory", f"{memory}M", "--bind", f"model={tmp_path / model}", code=code
-        )
-        if code:
-            assert "makes 9 MiB of the 8 MiB that --memory allows" in done.stderr
-            assert "`btfpipe compress`" in done.stderr
-
-
-def test_memory_that_holds_no_tile_is_refused_and_that_for_few_means_fewer_threads(
-    scene_file, btfpipe, tmp_path
-):
-    path = scene_file([GREY], film={"width": 600, "height": 600, "samples": 1})
-    out = tmp_path / "p.exr"
-    done = btfpipe("render", path, "-o", out, "--memory", "37M", code=3)  # 256 x 256 x 600 bytes
-    assert (
-        "scene.yaml: the rays of a tile of pixels take 38 MiB; --memory allows 37 MiB"
-        in done.stderr
-    )
-    assert "Pass --memory 38M." in done.stderr
-    assert load_scene(path, memory=3 * 256 * 256 * 600, threads=5).threads == 3
-    assert load_scene(path, memory=2**40, threads=5).threads == 5
-    btfpipe("render", path, "-o", out, "--memory", "38M", "--threads", 2)
-
-
 @pytest.mark.parametrize("name", ["width", "height", "samples"])
 def test_film_may_be_what_its_schema_allows_on_the_command_line_too(
     scene_file, btfpipe, tmp_path, name

@@ -1,5 +1,6 @@
 """The DAG: refuses bad configs, plans the sample run, prints what it would run."""
 
+import json
 import os
 import re
 import shutil
@@ -76,6 +77,41 @@ def test_commands_shown_by_the_dag_are_commands_of_the_program(workdir):
     shown = set(re.findall(r"^(?:Shell command: |\s*)btfpipe (\w+) ", done.stdout, re.MULTILINE))
     assert shown <= set(STAGES)
     assert {"ingest", "compress", "textons", "surface", "synthesize", "render"} <= shown
+
+
+def test_memory_of_the_config_goes_to_every_command(workdir):
+    for given, count in ({}, 0), ({"memory": "3.5G"}, 1):
+        config = change(workdir, exports={"weave": ["ubo"]}, **given)
+        done = snakemake("--dry-run", "--printshellcmds", "--configfile", config, cwd=workdir)
+        commands = re.findall(
+            r"^(?:Shell command: |\s*)btfpipe (\w+) (.*)", done.stdout, re.MULTILINE
+        )
+        used = {name for name, _ in commands}
+        assert used >= {"ingest", "compress", "compare", "surface", "render", "preview", "export"}
+        assert all(line.count("--memory 3.5G") == count for _, line in commands)
+        assert all(line.count("--memory") == count for _, line in commands)
+
+
+def test_memory_of_the_config_is_what_jobs_ask_for_and_makes_nothing_run_again(workdir):
+    target = "results/sample/samples/weave.plain.npz"
+    amounts = []
+    for given in ({}, {"memory": "3.5G"}):
+        config = change(workdir, **given)
+        ask = (target, "--benchmark-extended", "--configfile", config)
+        done = snakemake(*ask, cwd=workdir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        if amounts:
+            assert "Nothing to be done" in done.stdout + done.stderr
+            done = snakemake(*ask, "--force", cwd=workdir)
+        path = workdir / "results/sample/benchmarks/ingest_frontal/weave.jsonl"
+        amounts.append(json.loads(path.read_text())["resources"]["mem_mb"])
+    assert amounts == [1000, 500 + 3758]  # 3.5 GiB are 3758 MB
+
+
+def test_memory_that_is_no_amount_is_refused(workdir):
+    done = snakemake("--dry-run", "--configfile", change(workdir, memory="much"), cwd=workdir)
+    assert done.returncode == 1
+    assert "much" in done.stdout + done.stderr
 
 
 def test_config_readme_lists_every_key():

@@ -76,6 +76,18 @@ def option(flag, value):
     return " ".join([flag, *(shlex.quote(str(value)) for value in values)])
 
 
+# A resource, not a parameter: results do not hang on it, so that a change of it makes nothing run again.
+MEMORY = option("--memory", config.get("memory"))
+
+
+def mem_mb(usual):
+    """Memory of a rule's jobs (MB): what the config allows and pages of mapped files, or the usual."""
+    if "memory" not in config:
+        return usual
+    amount, unit = config["memory"][:-1], config["memory"][-1]
+    return 500 + int(float(amount) * 1024 ** (2 + "MGT".index(unit)) / 1e6)
+
+
 def sample_options(wildcards):
     """Options of `btfpipe ingest` for a sample."""
     sample = config["samples"][wildcards.sample]

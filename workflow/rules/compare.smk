@@ -18,14 +18,15 @@ rule compare_model:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=2000,
+        mem_mb=mem_mb(2000),
+        memory=MEMORY,
     params:
         code=code("metrics", "compression", "cli/compare.py"),
     message:
         "comparing the Model of {wildcards.sample} with its Sample"
     shell:
         "btfpipe compare {input.model:q} {input.sample:q} --picture {output.picture:q}"
-        " --threads {threads} --out {output.numbers:q} --quiet 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.numbers:q} --quiet 2> {log:q}"
 
 
 rule compare_truth:
@@ -48,14 +49,15 @@ rule compare_truth:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=2000,
+        mem_mb=mem_mb(2000),
+        memory=MEMORY,
     params:
         code=code("metrics", "compression", "cli/compare.py"),
     message:
         "comparing the {wildcards.what} of {wildcards.sample} with the truth between its directions"
     shell:
         "btfpipe compare {input.appearance:q} {input.truth:q} --interpolation all"
-        " --threads {threads} --out {output.numbers:q} --quiet 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.numbers:q} --quiet 2> {log:q}"
 
 
 rule fidelity:

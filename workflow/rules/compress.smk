@@ -12,7 +12,8 @@ rule compress:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=3000,
+        mem_mb=mem_mb(3000),
+        memory=MEMORY,
     params:
         options=" ".join(
             option(f"--{key}", config["compress"].get(key))
@@ -24,5 +25,5 @@ rule compress:
         "compressing {wildcards.sample}"
     shell:
         "btfpipe compress {input.sample:q} {params.options}"
-        " --seed {params.seed} --threads {threads}"
+        " --seed {params.seed} --threads {threads} {resources.memory}"
         " --out {output.model:q} --json > {output.summary:q} 2> {log:q}"

@@ -14,7 +14,8 @@ rule export:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=2000,
+        mem_mb=mem_mb(2000),
+        memory=MEMORY,
     params:
         # a factorisation that shows no difference to the eye
         terms=lambda wildcards: (
@@ -25,7 +26,7 @@ rule export:
         "writing {wildcards.sample} as {wildcards.format}"
     shell:
         "btfpipe export {input.sample:q} --format {wildcards.format} {params.terms}"
-        " --threads {threads} --out {output.file:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.file:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule ingest_export:
@@ -42,7 +43,8 @@ rule ingest_export:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=2000,
+        mem_mb=mem_mb(2000),
+        memory=MEMORY,
     params:
         # a list of pairs comes back as one
         pairs=lambda wildcards: "--pairs" if wildcards.format in ("ubo", "utia") else "",
@@ -51,7 +53,7 @@ rule ingest_export:
         "reading {wildcards.sample} back from {wildcards.format}"
     shell:
         "btfpipe ingest {input.file:q} {params.pairs}"
-        " --threads {threads} --out {output.appearance:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.appearance:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule formats_sheet:

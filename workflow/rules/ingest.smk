@@ -12,7 +12,8 @@ rule ingest:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=1000,
+        mem_mb=mem_mb(1000),
+        memory=MEMORY,
     params:
         options=sample_options,
         code=code("compression", "cli/ingest.py"),
@@ -20,7 +21,7 @@ rule ingest:
         "ingesting {wildcards.sample}"
     shell:
         "btfpipe ingest {input.source:q} {params.options}"
-        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule ingest_frontal:
@@ -37,7 +38,8 @@ rule ingest_frontal:
         "../envs/btfpipe.yaml"
     threads: 1
     resources:
-        mem_mb=1000,
+        mem_mb=mem_mb(1000),
+        memory=MEMORY,
     params:
         options=sample_options,
         code=code("compression", "cli/ingest.py"),
@@ -45,7 +47,7 @@ rule ingest_frontal:
         "taking the frontal picture of {wildcards.sample}"
     shell:
         "btfpipe ingest {input.source:q} --frontal {params.options}"
-        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
 
 
 rule ingest_truth:
@@ -62,11 +64,12 @@ rule ingest_truth:
         "../envs/btfpipe.yaml"
     threads: 1
     resources:
-        mem_mb=1000,
+        mem_mb=mem_mb(1000),
+        memory=MEMORY,
     params:
         code=code("compression", "cli/ingest.py"),
     message:
         "ingesting the ground truth of {wildcards.sample}"
     shell:
         "btfpipe ingest {input.source:q} --pairs"
-        " --threads {threads} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.sample:q} --json > {output.summary:q} 2> {log:q}"

@@ -15,7 +15,8 @@ rule render:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=4000,
+        mem_mb=mem_mb(4000),
+        memory=MEMORY,
     params:
         width=lookup("film/width", within=config),
         height=lookup("film/height", within=config),
@@ -27,7 +28,7 @@ rule render:
     shell:
         "btfpipe render {input.scene:q} --bind surface={input.surface:q} --bind map={input.map:q}"
         " --bind model={input.model:q} --width {params.width} --height {params.height}"
-        " --samples {params.samples} --seed {params.seed} --threads {threads}"
+        " --samples {params.samples} --seed {params.seed} --threads {threads} {resources.memory}"
         " --out {output.picture:q} --json > {output.summary:q} 2> {log:q}"
 
 
@@ -67,13 +68,14 @@ rule preview:
         "../envs/btfpipe.yaml"
     threads: 1
     resources:
-        mem_mb=1000,
+        mem_mb=mem_mb(1000),
+        memory=MEMORY,
     params:
         code=code("rendering", "cli/preview.py"),
     message:
         "tone-mapping {wildcards.look} in scene {wildcards.scene}"
     shell:
-        "btfpipe preview {input.picture:q} --out {output.png:q} --quiet 2> {log:q}"
+        "btfpipe preview {input.picture:q} {resources.memory} --out {output.png:q} --quiet 2> {log:q}"
 
 
 rule preview_btf_and_texture:
@@ -95,10 +97,12 @@ rule preview_btf_and_texture:
         "../envs/btfpipe.yaml"
     threads: 1
     resources:
-        mem_mb=1000,
+        mem_mb=mem_mb(1000),
+        memory=MEMORY,
     params:
         code=code("rendering", "cli/preview.py"),
     message:
         "setting {wildcards.look} beside its plain texture"
     shell:
-        "btfpipe preview {input.btf:q} {input.plain:q} --columns 2 --out {output.png:q} --quiet 2> {log:q}"
+        "btfpipe preview {input.btf:q} {input.plain:q} --columns 2 {resources.memory}"
+        " --out {output.png:q} --quiet 2> {log:q}"

@@ -17,7 +17,8 @@ rule simulate_truth:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=2000,
+        mem_mb=mem_mb(2000),
+        memory=MEMORY,
     params:
         seed=lookup("seed", within=config),
         code=code("simulation", "cli/simulate.py"),
@@ -25,4 +26,4 @@ rule simulate_truth:
         "simulating {wildcards.sample} at directions that nobody measured"
     shell:
         "btfpipe simulate {input.spec:q} --directions {input.pairs:q} --format exr --seed {params.seed}"
-        " --threads {threads} --out {output.stack:q} --json > {output.summary:q} 2> {log:q}"
+        " --threads {threads} {resources.memory} --out {output.stack:q} --json > {output.summary:q} 2> {log:q}"

@@ -13,7 +13,8 @@ rule surface:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=4000,
+        mem_mb=mem_mb(4000),
+        memory=MEMORY,
     params:
         vertices=lambda wildcards: config["surfaces"][wildcards.surface]["vertices"],
         field=lambda wildcards, input: option("--field", input.field or None),
@@ -27,5 +28,5 @@ rule surface:
         "resampling {wildcards.surface} to {params.vertices} vertices"
     shell:
         "btfpipe surface {input.mesh:q} --vertices {params.vertices} {params.field} {params.crease}"
-        " --levels {params.levels} --seed {params.seed} --threads {threads}"
+        " --levels {params.levels} --seed {params.seed} --threads {threads} {resources.memory}"
         " --out {output.surface:q} --json > {output.summary:q} 2> {log:q}"

@@ -13,7 +13,8 @@ rule synthesize:
         "../envs/btfpipe.yaml"
     threads: 1
     resources:
-        mem_mb=3000,
+        mem_mb=mem_mb(3000),
+        memory=MEMORY,
     params:
         k=of_look("k"),
         turn=of_look("turn_deg"),
@@ -28,5 +29,5 @@ rule synthesize:
     shell:
         "btfpipe synthesize {input.features:q} {input.surface:q} -k {params.k}"
         " --levels {params.levels}"
-        " --turn-deg {params.turn} {params.scale} --seed {params.seed} --threads {threads}"
+        " --turn-deg {params.turn} {params.scale} --seed {params.seed} --threads {threads} {resources.memory}"
         " --out {output.map:q} --json > {output.summary:q} 2> {log:q}"

@@ -12,7 +12,8 @@ rule textons:
         "../envs/btfpipe.yaml"
     threads: 2
     resources:
-        mem_mb=3000,
+        mem_mb=mem_mb(3000),
+        memory=MEMORY,
     params:
         textons=lookup("textons/textons", within=config),
         images=lookup("textons/images", within=config),
@@ -23,5 +24,5 @@ rule textons:
         "extracting {params.textons} surface textons of {wildcards.sample}"
     shell:
         "btfpipe textons {input.model:q} --textons {params.textons} --images {params.images}"
-        " --levels {params.levels} --seed {params.seed} --threads {threads}"
+        " --levels {params.levels} --seed {params.seed} --threads {threads} {resources.memory}"
         " --out {output.features:q} --json > {output.summary:q} 2> {log:q}"
