@@ -84,7 +84,7 @@ def open_appearance(path, material=None):
     reader = store.read(path, ("sample", "model"))
     if reader.kind == "sample":
         return choose_material(Sample.from_reader(reader), material, path)
-    name = reader.about.get("method")
+    name = reader.fact("method", "text")
     if name not in METHODS:
         raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
     method = METHODS[name]

@@ -207,6 +207,11 @@ def sample_sheet(appearance, lights=6, views=6):
     pictures : list of (rows, cols, 3) float32
     labels : list of str
     columns : int
+
+    Raises
+    ------
+    InputError
+        If values are not finite.
     """
     from btfpipe.directions import to_angles
 
@@ -218,7 +223,11 @@ def sample_sheet(appearance, lights=6, views=6):
             (appearance.view_directions, appearance.view_index),
         )
     )
-    pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
+    with np.errstate(over="ignore", invalid="ignore"):  # shows in the pictures
+        pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
+    bad = sum(not np.isfinite(picture).all() for picture in pictures)
+    if bad:
+        raise InputError(f"{bad} of the {len(pairs)} pictures to show hold non-finite values.")
     labels = [
         "light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(
             *np.degrees(to_angles(w_i[pair])), *np.degrees(to_angles(w_o[pair]))
@@ -298,7 +307,12 @@ def preview(
             )
         if layer != "colour":
             raise InputError(f"{paths[0]}: a Sample or Model has no layer {layer}.")
-        linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
+        try:
+            linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
+        except InputError as error:
+            if str(paths[0]) in str(error):
+                raise
+            raise InputError(f"{paths[0]}: {error}") from error
         columns = columns or columns_found
     else:
         channels = [read_channels(p) for p in paths]
