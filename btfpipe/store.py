@@ -58,7 +58,11 @@ _FORMS = {
     ),
     "positive": (
         "a positive number",
-        lambda value: type(value) in (int, float) and 1 / _MOST_NUMBER < value < _MOST_NUMBER,
+        lambda value: (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and 1 / _MOST_NUMBER < value < _MOST_NUMBER
+        ),
     ),
 }
 
@@ -559,7 +563,7 @@ def check_fact(value, form, what):
     """A value of a description, refused if it has another form (see `Reader.fact`); `what` is what messages call it."""
     wanted, fits = _FORMS[form]
     if not fits(value):
-        raise InputError(f"{what} is {str(value)[:40]!s}; expected {wanted}.")
+        raise InputError(f"{what} is {value!r:.40}; expected {wanted}.")
     return value
 
 

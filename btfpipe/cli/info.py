@@ -77,7 +77,7 @@ def _lines(thing, depth):
             yield f"{indent}{name}:"
             for number, item in enumerate(value):
                 rest = {k: v for k, v in item.items() if k != "name"}
-                yield from _lines({item.get("name", number): rest}, depth + 1)
+                yield from _lines({str(item.get("name", number)): rest}, depth + 1)
         elif isinstance(value, dict) and value:
             yield f"{indent}{name}:"
             yield from _lines(value, depth + 1)

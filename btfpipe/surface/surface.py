@@ -87,7 +87,10 @@ class Surface:
                 if np.abs(np.linalg.norm(vectors, axis=1) - 1).max() > _UNIT:
                     raise InputError(f"{path}: {name} of level {i} are not all unit vectors.")
                 frame.append(vectors)
-            level = Level(vertices, faces, *frame)
+            normals, tangents = (np.asarray(vectors, np.float32) for vectors in frame)
+            level = Level(
+                np.asarray(vertices, np.float64), np.asarray(faces, np.int32), normals, tangents
+            )
             if p + "parent_face" in reader:
                 level.parent_face = reader.require(p + "parent_face", (n,), "i")
                 level.parent_weights = reader.require(
