@@ -39,6 +39,7 @@ _PADDING_ID = 0xD935  # the extra-field id that alignment tools for zip files us
 _ABOUT = "about.json"
 # What numpy raises of a header with wrong bytes, and reading of a file that ends early.
 _BROKEN = (ValueError, TypeError, SyntaxError, tokenize.TokenError, OSError, EOFError, struct.error)
+_NO_ZIP = (zipfile.BadZipFile, OSError, ValueError, NotImplementedError)  # what `zipfile` raises
 _MOST_NUMBER = 1e30  # of a description, whose reciprocal is still within single precision
 # What a description's facts may be: in words, and whether a value is one.
 _FORMS = {
@@ -572,7 +573,7 @@ def is_ours(path):
     try:
         with zipfile.ZipFile(path) as archive:
             return _ABOUT in archive.namelist()
-    except (zipfile.BadZipFile, OSError):
+    except _NO_ZIP:
         return False
 
 
@@ -662,7 +663,7 @@ def digest(path):
     try:
         with zipfile.ZipFile(path) as archive:
             return _members_digest(archive.infolist())
-    except (zipfile.BadZipFile, OSError):
+    except _NO_ZIP:
         pass
     try:
         with path.open("rb") as file:

@@ -87,9 +87,12 @@ def prepare(
     levels = []
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
-        fine, place, weights = resample(
-            source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
-        )
+        try:
+            fine, place, weights = resample(
+                source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
+            )
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
         if i == 0:
             _check_count(name, len(place), wanted, len(euler))
         normals = source.normals(place, weights)
