@@ -109,7 +109,10 @@ def prepare(
         )
         fallbacks.append(missed)
     report(n_levels, n_levels + 1)
-    _lay_field(levels, strokes, turn)
+    try:
+        _lay_field(levels, strokes, turn)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
     finest = levels[0]
     index = field.singularities(finest.faces, finest.normals, finest.tangents)
     pair = edges(finest.faces)
