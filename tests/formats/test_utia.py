@@ -162,7 +162,7 @@ def test_colours_beyond_half_precision_are_refused_and_not_made_infinite(tmp_pat
         measurement.read(0)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 3e38])
+@pytest.mark.parametrize("bad", [np.inf, 3e38])
 def test_colours_that_are_no_numbers_in_rgb_come_out_so_without_a_warning(tmp_path, bad):
     xyz = np.full((4, 4, 3), 1, np.float32)
     xyz[1, 1] = [bad, -bad, bad]
