@@ -39,6 +39,7 @@ _PADDING_ID = 0xD935  # the extra-field id that alignment tools for zip files us
 _ABOUT = "about.json"
 # What numpy raises of a header with wrong bytes, and reading of a file that ends early.
 _BROKEN = (ValueError, TypeError, SyntaxError, tokenize.TokenError, OSError, EOFError, struct.error)
+_SINGLE = float(np.finfo(np.float32).max)
 _NO_ZIP = (zipfile.BadZipFile, OSError, ValueError, NotImplementedError)  # what `zipfile` raises
 _MOST_NUMBER = 1e30  # of a description, whose reciprocal is still within single precision
 # What a description's facts may be: in words, and whether a value is one.
@@ -514,7 +515,7 @@ class Reader:
             raise InputError(f"{self.path}: its description lacks {name!r}.")
         return check_fact(value, form, f"{self.path}: {name}")
 
-    def require(self, name, shape, dtype=None, finite=True, most=math.inf):
+    def require(self, name, shape, dtype=None, finite=True, most=_SINGLE):
         """Map array `name` and check it.
 
         Parameters
@@ -528,7 +529,8 @@ class Reader:
             Refuse NaN and infinity in floating-point arrays. Leave it out only for bulk data whose
             reading would cost more than the work that follows.
         most : float
-            Greatest absolute value, for what is squared or multiplied later on.
+            Greatest absolute value, for what is squared or multiplied later on; by default that of single precision, as
+            in which all is worked with.
 
         Raises
         ------
@@ -546,7 +548,7 @@ class Reader:
         if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
             bad = int(np.size(array) - np.isfinite(array).sum())
             raise InputError(f"{self.path}: {name} holds {bad} NaN or infinite values.")
-        if array.size and most < math.inf:
+        if finite and array.size and (most < _SINGLE or array.dtype == np.float64):
             reached = max(float(array.max()), -float(array.min()))
             if reached > most:
                 raise InputError(

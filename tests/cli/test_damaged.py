@@ -85,6 +85,7 @@ ARRAYS = [
     ("svd", {"texture_factors": np.zeros((6, 6, 2), ">f4")}, "no kind of number that btfpipe"),
     ("svd", {"texture_factors": np.zeros((6, 6, 2), "g")}, "no kind of number that btfpipe"),
     ("coded", {"singular_values": None}, "factors are not finite"),
+    ("coded", {"colour": np.full((3, 3), 1e100)}, "colour reaches 1e.100"),
     ("features", {"level0_vectors": np.full((65, 2), 1e30)}, "level0_vectors reaches"),
     ("surface", {"level0_vertices": SQUARE * 1e200}, "level 0: spans"),
     ("surface", {"level0_vertices": SQUARE * 1e-30}, "level 0: spans"),
