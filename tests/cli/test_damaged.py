@@ -87,7 +87,7 @@ ARRAYS = [
     ("coded", {"singular_values": None}, "factors are not finite"),
     ("coded", {"colour": np.full((3, 3), 1e100)}, "colour reaches 1e.100"),
     ("features", {"level0_vectors": np.full((65, 2), 1e30)}, "level0_vectors reaches"),
-    ("surface", {"level0_vertices": SQUARE * 1e200}, "level 0: spans"),
+    ("surface", {"level0_vertices": SQUARE * 1e20}, "level 0: spans"),
     ("surface", {"level0_vertices": SQUARE * 1e-30}, "level 0: spans"),
     ("surface", {"level0_tangents": np.full((4, 3), 3e38, np.float32)}, "level0_tangents reaches"),
     ("surface", {"level0_normals": np.zeros((4, 3), np.float32)}, "normals of level 0 are not all unit"),
