@@ -73,6 +73,17 @@ def read_description(path, what, form=""):
     return thing
 
 
+def validator(schema):
+    """A validator of jsonschema for which a whole number is written as one: 4.0, which it would take for 4, is no count."""
+    import jsonschema
+
+    base = jsonschema.Draft202012Validator
+    types = base.TYPE_CHECKER.redefine(
+        "integer", lambda _, value: isinstance(value, int) and not isinstance(value, bool)
+    )
+    return jsonschema.validators.extend(base, type_checker=types)(schema)
+
+
 def key_path(keys):
     """``objects[1].plane`` of a path of keys and indices."""
     text = ""

@@ -39,6 +39,34 @@ _PADDING_ID = 0xD935  # the extra-field id that alignment tools for zip files us
 _ABOUT = "about.json"
 # What numpy raises of a header with wrong bytes, and reading of a file that ends early.
 _BROKEN = (ValueError, TypeError, SyntaxError, tokenize.TokenError, OSError, EOFError, struct.error)
+_SINGLE = float(np.finfo(np.float32).max)
+_NO_ZIP = (zipfile.BadZipFile, OSError, ValueError, NotImplementedError)  # what `zipfile` raises
+_MOST_NUMBER = 1e30  # of a description, whose reciprocal is still within single precision
+# What a description's facts may be: in words, and whether a value is one.
+_FORMS = {
+    "text": ("a text", lambda value: isinstance(value, str)),
+    "flag": ("true or false", lambda value: isinstance(value, bool)),
+    "count": (
+        "a whole number from 1",
+        lambda value: type(value) is int and 0 < value < _MOST_NUMBER,
+    ),
+    "shape": (
+        "two whole numbers from 1",
+        lambda value: (
+            isinstance(value, list)
+            and len(value) == 2
+            and all(type(n) is int and 0 < n < _MOST_NUMBER for n in value)
+        ),
+    ),
+    "positive": (
+        "a positive number",
+        lambda value: (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and 1 / _MOST_NUMBER < value < _MOST_NUMBER
+        ),
+    ),
+}
 
 
 @contextlib.contextmanager
@@ -393,6 +421,8 @@ class Reader:
                         f"{path}: a zip file, but not one of btfpipe's (no {_ABOUT} inside)."
                         f"{_expected(kind)} `btfpipe info {path}` says what it is."
                     )
+                if archive.getinfo(_ABOUT).compress_type != zipfile.ZIP_STORED:
+                    raise ValueError(f"{_ABOUT} is compressed")
                 self.about = json.loads(archive.read(_ABOUT))
                 if not (
                     isinstance(self.about, dict)
@@ -404,7 +434,7 @@ class Reader:
                     self._members[info.filename] = info
         except FileNotFoundError as error:
             raise InputError(f"{path}: no such file.{_expected(kind)}") from error
-        except (zipfile.BadZipFile, OSError, ValueError) as error:
+        except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
             raise InputError(
                 f"{path}: not a btfpipe file, or damaged ({error}).{_expected(kind)}"
                 f" `btfpipe info {path}` says what it is."
@@ -457,11 +487,35 @@ class Reader:
         size = int(np.prod(shape, dtype=object)) * dtype.itemsize
         if fortran or dtype.hasobject or info.file_size != offset - start + size:
             raise ValueError(f"{info.file_size} bytes do not hold {shape} of {dtype}")
+        if dtype.kind not in "biuf" or dtype.itemsize > 8 or not dtype.isnative:
+            raise ValueError(f"{dtype.str} is no kind of number that btfpipe writes")
         if size == 0:
             return np.zeros(shape, dtype)
         return np.memmap(self.path, dtype, "r", offset, shape)
 
-    def require(self, name, shape, dtype=None, finite=True):
+    def fact(self, name, form, *default):
+        """One value of the description, checked.
+
+        Parameters
+        ----------
+        name : str
+        form : str
+            ``text``, ``flag``, ``count``, ``shape`` or ``positive``.
+        *default
+            What a missing value or null stands for; without it they are refused.
+
+        Raises
+        ------
+        InputError
+        """
+        value = self.about.get(name)
+        if value is None and default:
+            return default[0]
+        if name not in self.about:
+            raise InputError(f"{self.path}: its description lacks {name!r}.")
+        return check_fact(value, form, f"{self.path}: {name}")
+
+    def require(self, name, shape, dtype=None, finite=True, most=_SINGLE):
         """Map array `name` and check it.
 
         Parameters
@@ -474,6 +528,9 @@ class Reader:
         finite : bool
             Refuse NaN and infinity in floating-point arrays. Leave it out only for bulk data whose
             reading would cost more than the work that follows.
+        most : float
+            Greatest absolute value, for what is squared or multiplied later on; by default that of single precision, as
+            in which all is worked with.
 
         Raises
         ------
@@ -491,6 +548,12 @@ class Reader:
         if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
             bad = int(np.size(array) - np.isfinite(array).sum())
             raise InputError(f"{self.path}: {name} holds {bad} NaN or infinite values.")
+        if finite and array.size and (most < _SINGLE or array.dtype == np.float64):
+            reached = max(float(array.max()), -float(array.min()))
+            if reached > most:
+                raise InputError(
+                    f"{self.path}: {name} reaches {reached:.3g}; expected at most {most:.3g}. The file is damaged."
+                )
         return array
 
     @property
@@ -499,12 +562,20 @@ class Reader:
         return _members_digest(self._members.values())
 
 
+def check_fact(value, form, what):
+    """A value of a description, refused if it has another form (see `Reader.fact`); `what` is what messages call it."""
+    wanted, fits = _FORMS[form]
+    if not fits(value):
+        raise InputError(f"{what} is {value!r:.40}; expected {wanted}.")
+    return value
+
+
 def is_ours(path):
     """Whether a file is a container of the project's (perhaps of a newer version, perhaps damaged)."""
     try:
         with zipfile.ZipFile(path) as archive:
             return _ABOUT in archive.namelist()
-    except (zipfile.BadZipFile, OSError):
+    except _NO_ZIP:
         return False
 
 
@@ -594,7 +665,7 @@ def digest(path):
     try:
         with zipfile.ZipFile(path) as archive:
             return _members_digest(archive.infolist())
-    except (zipfile.BadZipFile, OSError):
+    except _NO_ZIP:
         pass
     try:
         with path.open("rb") as file:

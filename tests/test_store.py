@@ -367,3 +367,20 @@ def test_ours_is_known_from_foreign(path, tmp_path):
     np.savez(tmp_path / "numpy.npz", x=np.zeros(3))
     assert not store.is_ours(tmp_path / "numpy.npz")
     assert not store.is_ours(tmp_path / "none")
+
+
+def test_zip_files_of_another_version_and_descriptions_beyond_measure_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    store.write(path, "sample", {})
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"PK\1\2") + 6] = 144  # the version that reading takes
+    path.write_bytes(data)
+    assert not store.is_ours(path)
+    assert len(store.digest(path)) == 12
+    with pytest.raises(InputError, match="not a btfpipe file, or damaged"):
+        store.read(path)
+    for packing, about in ((zipfile.ZIP_STORED, "[" * 100_000), (zipfile.ZIP_DEFLATED, "{}")):
+        with zipfile.ZipFile(path, "w", packing) as archive:
+            archive.writestr("about.json", about)
+        with pytest.raises(InputError, match="not a btfpipe file, or damaged"):
+            store.read(path)

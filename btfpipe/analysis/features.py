@@ -61,23 +61,35 @@ class Features:
     @classmethod
     def open(cls, path):
         """Map Features from their file, checking labels, shapes and finiteness."""
+        from btfpipe.analysis.pyramid import check_pyramid, largest_feature
+
         reader = store.read(path, "features")
+        sides = [reader.fact(name, "count") for name in ("neighbourhood", "coarse_neighbourhood")]
+        reader.fact("toroidal", "flag", False)
         levels = []
-        for i in range(reader.about["levels"]):
+        for i in range(reader.fact("levels", "count")):
             p = f"level{i}_"
             labels = reader.require(p + "labels", (None, None), "i")
             vectors = reader.require(p + "vectors", (None, None), "f")
-            n = len(vectors)
+            n, dimensions = vectors.shape
+            most = largest_feature(max(dimensions, 1), *sides)
+            reader.require(p + "vectors", vectors.shape, most=most)
             if labels.size == 0 or labels.min() < 0 or labels.max() > n - 1:
                 raise InputError(f"{path}: labels of level {i} do not fit its {n - 1} vectors.")
             level = FeatureLevel(labels, vectors)
             if p + "gram" in reader:
-                level.gram = reader.require(p + "gram", (n, n), "f")
+                level.gram = reader.require(p + "gram", (n, n), "f", most=dimensions * most**2)
             if p + "neighbours" in reader:
                 level.neighbours = reader.require(p + "neighbours", (*labels.shape, None), "i")
-                if level.neighbours.min() < 0 or level.neighbours.max() >= labels.size:
+                low, high = level.neighbours.min(initial=0), level.neighbours.max(initial=0)
+                if low < 0 or high >= labels.size:
                     raise InputError(f"{path}: neighbour lists of level {i} leave the sample.")
+            if i and labels.shape != tuple(n >> i for n in levels[0].shape):
+                raise InputError(
+                    f"{path}: level {i} has {labels.shape} texels; expected the halves of the one before."
+                )
             levels.append(level)
+        check_pyramid(levels[0].shape, len(levels), *sides, str(path))
         return cls(levels, reader.about)
 
     def save(self, path):

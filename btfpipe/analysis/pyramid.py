@@ -154,7 +154,7 @@ def plain_features(
     if mask is not None:
         image = fill_invalid(image, mask, toroidal)
     require_finite(image, "feature image")
-    _require_distances(image, neighbourhood**2 + coarse_neighbourhood**2)
+    _require_distances(image, neighbourhood, coarse_neighbourhood)
     image = image.astype(np.float32)
     check_pyramid(image.shape[:2], levels, neighbourhood, coarse_neighbourhood, "feature image")
     made = []
@@ -196,10 +196,16 @@ def require_finite(image, what):
         )
 
 
-def _require_distances(image, texels):
-    """Refuse values whose squared distances, summed over so many texels, leave single precision."""
+def largest_feature(dimensions, *sides):
+    """The greatest value whose squared distances in so many dimensions, summed over squares of these sides, are in single precision."""
+    texels = sum(side * side for side in sides)
+    return math.sqrt(float(np.finfo(np.float32).max) / (4 * dimensions * texels))
+
+
+def _require_distances(image, *sides):
+    """Refuse values that are larger than `largest_feature`."""
     largest = max(abs(float(image.max())), abs(float(image.min())))
-    limit = math.sqrt(float(np.finfo(np.float32).max) / (4 * image.shape[2] * texels))
+    limit = largest_feature(image.shape[2], *sides)
     if largest > limit:
         raise InputError(
             f"feature image reaches {largest:.3g}; squared distances overflow single precision beyond"

@@ -140,7 +140,7 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
         ways = (None,) if comparison.matching_pairs(stand_in, reference) is not None else _WAYS[:1]
     white, white_is = comparison.white_level(reference)
     results = {}
-    with progress("compare: pictures", quiet) as report:
+    with naming(f"{model} against {sample}"), progress("compare: pictures", quiet) as report:
         for done_ways, way in enumerate(ways):
             results[way or "own_pairs"] = comparison.compare(
                 stand_in,

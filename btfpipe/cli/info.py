@@ -26,8 +26,8 @@ def info(file, threads, quiet):
 
             reader = store.read(file)
             facts = describe_container(reader, report)
-            if reader.kind == "model" and not facts["problems"]:
-                facts["problems"] += _refusal(file)
+            if not facts["problems"]:
+                facts["problems"] += _refusal(file, reader.kind)
         else:
             from btfpipe.formats.describe import describe_foreign
 
@@ -35,16 +35,26 @@ def info(file, threads, quiet):
     return {"inputs": [file], **facts, "text": "\n".join([f"{file}:", *_lines(facts, 1)])}
 
 
-def _refusal(model):
-    """What a Model's own reader finds wrong with its file, as a list of sentences."""
+def _refusal(file, kind):
+    """What its own reader finds wrong with one of btfpipe's files, as a list of sentences."""
+    from btfpipe.analysis.features import Features
     from btfpipe.compression import open_appearance
+    from btfpipe.surface.surface import Surface
+    from btfpipe.synthesis.coordinate_map import CoordinateMap
 
+    readers = {
+        "sample": open_appearance,
+        "model": open_appearance,
+        "features": Features.open,
+        "surface": Surface.open,
+        "map": CoordinateMap.open,
+    }
+    if kind not in readers:
+        return [f"{file}: its kind is {kind!r}; expected one of {', '.join(readers)}."]
     try:
-        open_appearance(model)
+        readers[kind](file)
     except BtfError as error:
         return [str(error)]
-    except KeyError as error:
-        return [f"{model}: its description lacks {error}."]
     return []
 
 
@@ -67,7 +77,7 @@ def _lines(thing, depth):
             yield f"{indent}{name}:"
             for number, item in enumerate(value):
                 rest = {k: v for k, v in item.items() if k != "name"}
-                yield from _lines({item.get("name", number): rest}, depth + 1)
+                yield from _lines({str(item.get("name", number)): rest}, depth + 1)
         elif isinstance(value, dict) and value:
             yield f"{indent}{name}:"
             yield from _lines(value, depth + 1)

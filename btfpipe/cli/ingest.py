@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from btfpipe import store
-from btfpipe.cli.options import FiniteFloat, flag, input_file, progress, stage
+from btfpipe.cli.options import FiniteFloat, flag, input_file, naming, progress, stage
 from btfpipe.errors import InputError
 
 MOST_TEXELS = 16384  # a side
@@ -181,9 +181,10 @@ def ingest(source, format_, out, threads, quiet, **options):
             measurement = with_cosine(measurement)
         if frontal:
             measurement = nearest_only(measurement)
-        facts = ingest_measurement(
-            measurement, out, threads=threads, report=report, about=about, **options
-        )
+        with naming(source):
+            facts = ingest_measurement(
+                measurement, out, threads=threads, report=report, about=about, **options
+            )
     if not quiet:
         for warning in facts.get("warnings", []):
             click.echo(f"Warning: {warning.rstrip('.')}.", err=True)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import click
 
-from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
+from btfpipe.cli.options import input_file, naming, progress, refuse_inputs, stage
 
 _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 
@@ -52,7 +52,8 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
     from btfpipe.simulation.spec import plan, read_spec, vectors_of
 
     wanted = read_spec(spec)
-    lights, views, index = plan(wanted, pairs)
+    with naming(pairs or spec):
+        lights, views, index = plan(wanted, pairs)
 
     def beside(name):
         refuse_inputs(out, [spec.parent / name])
@@ -62,8 +63,9 @@ def simulate(spec, out, seed, threads, memory, quiet, pairs, file_format, qualit
         picture=lambda name: read_picture(beside(name)),
         mesh=lambda name: read_parts(beside(name)),
     )
-    patch = materials.build_patch(wanted, files)
-    memory -= campaign.require_memory(patch, wanted["inter_reflection"]["rays"], memory)
+    with naming(spec):
+        patch = materials.build_patch(wanted, files)
+        memory -= campaign.require_memory(patch, wanted["inter_reflection"]["rays"], memory)
     goniometer = Goniometer(
         patch, wanted["samples"], **wanted["inter_reflection"], seed=seed, threads=threads
     )

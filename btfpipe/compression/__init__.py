@@ -100,7 +100,7 @@ def _read(path):
     reader = store.read(path, ("sample", "model"))
     if reader.kind == "sample":
         return reader, Sample
-    name = reader.about.get("method")
+    name = reader.fact("method", "text")
     if name not in METHODS:
         raise InputError(f"{path}: a Model of method {name!r}, which this btfpipe does not know.")
     method = METHODS[name]

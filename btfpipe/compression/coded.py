@@ -154,6 +154,7 @@ def _sizes(reader):
         or not all(isinstance(n, int) and 1 <= n <= 1 << 20 for a in whole for n in a)
         or not isinstance(about.get("step"), float)
         or not 0 < about["step"] < math.inf
+        or max(about["terms"][1:]) > about["terms"][0]
     ):
         raise InputError(f"{reader.path}: the description lacks the factors' shape and step.")
     return whole
@@ -449,13 +450,21 @@ def _file_bytes(members, source, about):
 
 def _unpack(members, source, about):
     """Texture factors (rows, cols, n) and the three angular factors (pairs, n_k), float32, of coded members."""
+    n, *terms = about["terms"]
+    with np.errstate(all="ignore"):  # shows in the factors
+        texture, angular = _transform(members, source, n, terms, np.float32(about["step"]))
+    if not all(np.isfinite(factors).all() for factors in (texture, *angular)):
+        raise InputError("its factors are not finite: damaged.")
+    return texture, angular
+
+
+def _transform(members, source, n, terms, step):
     from scipy.fft import idctn
 
-    n, *terms = about["terms"]
     singular = np.asarray(members["singular_values"], np.float32)
     texture = decode_planes(members["texture_code"], (n, *source.shape))
     texture = texture.astype(np.float32)
-    texture *= (np.float32(about["step"]) / singular)[:, None, None]
+    texture *= (step / singular)[:, None, None]
     texture = idctn(texture, axes=(1, 2), norm="ortho", overwrite_x=True)
     texture = np.ascontiguousarray(texture.transpose(1, 2, 0))  # one copy at a time
     if "view_basis" in members:
@@ -471,7 +480,7 @@ def _unpack(members, source, about):
         shape = (1, source.n_pairs)
     planes = decode_planes(members["angular_code"], (sum(terms), *shape))
     planes = planes.astype(np.float32)
-    planes *= np.float32(about["step"])
+    planes *= step
     if "view_basis" in members:
         with single_threaded_blas():
             planes = view @ planes @ light.T

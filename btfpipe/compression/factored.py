@@ -156,13 +156,13 @@ class FactoredModel(Model):
         return cls(
             angular,
             texture,
-            about.get("space"),
+            reader.fact("space", "text"),
             source,
             matrix=reader.require("colour_matrix", (3, 3), "f") if pca else None,
             mean=reader.require("colour_mean", (3,), "f") if pca else None,
-            log_range=about.get("log_range", False),
+            log_range=reader.fact("log_range", "flag", False),
             pair_factor=reader.require("pair_factor", (n_pairs,), "f") if factor else None,
-            epsilon=about.get("epsilon", EPSILON),
+            epsilon=reader.fact("epsilon", "positive", EPSILON),
             about=about,
         )
 

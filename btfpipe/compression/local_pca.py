@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from btfpipe import store
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_passes import (
     JOINT_TERMS,
@@ -32,6 +33,14 @@ from btfpipe.sample.resample import Resampled
 # the numbers of the paper.
 DEFAULT_RATIO = 54
 _DIRECTIONS = ("light_directions", "view_directions", "light_index", "view_index")
+# The facts of a material, with their forms; those of `_FACTS` are a Model's own.
+_FORMS = {
+    "name": "text",
+    "shape": "shape",
+    "toroidal": "flag",
+    "texels_per_mm": "positive",
+    "absolute": "flag",
+}
 _FACTS = ("toroidal", "texels_per_mm", "absolute")
 
 
@@ -129,16 +138,21 @@ class LocalPcaModel(Model):
     def from_arrays(cls, reader, source):
         about = reader.about
         materials, chosen = about.get("materials"), about.get("material", 0)
-        wanted = {"name", "shape", *_FACTS}
         if (
             not isinstance(materials, list)
-            or not all(isinstance(fact, dict) and wanted <= set(fact) for fact in materials)
-            or not isinstance(chosen, int)
+            or not all(isinstance(fact, dict) and set(_FORMS) <= set(fact) for fact in materials)
+            or type(chosen) is not int
             or not 0 <= chosen < len(materials)
         ):
             raise InputError(
                 f"{reader.path}: its description does not say which materials it holds."
             )
+        for number, fact in enumerate(materials):
+            for name, form in _FORMS.items():
+                if name != "texels_per_mm" or fact[name] is not None:
+                    store.check_fact(
+                        fact[name], form, f"{reader.path}: {name} of material {number}"
+                    )
         texels = sum(math.prod(fact["shape"]) for fact in materials)
         coordinates = reader.require("coordinates", (texels, None), "f")
         shape = (None, len(source.light_index), 3, 1 + coordinates.shape[1])

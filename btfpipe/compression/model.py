@@ -10,7 +10,7 @@ from btfpipe import store
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import Appearance
-from btfpipe.sample.sample import check_index
+from btfpipe.sample.sample import check_index, read_directions
 
 _TABLES = ("light_directions", "view_directions", "light_index", "view_index")
 _BLOCK_BYTES = 16 << 20  # linear pictures compared at a time; products with few wait for memory
@@ -62,6 +62,8 @@ class Model(Appearance):
             if str(reader.path) in str(error):
                 raise
             raise InputError(f"{reader.path}: {error}") from error  # of a constructor
+        if not model.n_pairs or 0 in model.shape:
+            raise InputError(f"{reader.path}: holds no pair, or no texel.")
         mask = model.mask
         if mask is not None and (mask.shape != model.shape or mask.dtype != bool):
             raise InputError(
@@ -95,9 +97,7 @@ def tables(source):
 
 def read_tables(reader):
     """Directions, index tables and facts of a Model's file, as attributes."""
-    about = reader.about
-    lights = reader.require("light_directions", (None, 3), "f")
-    views = reader.require("view_directions", (None, 3), "f")
+    lights, views = read_directions(reader)
     if "light_index" in reader:
         index = [reader.require(name, (None,), "iu") for name in _TABLES[2:]]
         try:
@@ -113,9 +113,9 @@ def read_tables(reader):
         view_directions=views,
         light_index=index[0],
         view_index=index[1],
-        toroidal=about["toroidal"],
-        texels_per_mm=about["texels_per_mm"],
-        absolute=about["absolute"],
+        toroidal=reader.fact("toroidal", "flag"),
+        texels_per_mm=reader.fact("texels_per_mm", "positive", None),
+        absolute=reader.fact("absolute", "flag"),
         mask=reader["mask"] if "mask" in reader else None,
     )
 

@@ -136,8 +136,8 @@ class RelightingModel(Model):
             reader.require("colour", (*coefficients.shape[:2], 3), "u")
             if "colour" in reader
             else None,
-            reader.about.get("basis"),
-            reader.about.get("transfer"),
+            reader.fact("basis", "text"),
+            reader.fact("transfer", "text"),
             source=source,
             about=reader.about,
         )

@@ -47,32 +47,42 @@ def read_mesh(path):
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
-    vertices, polygons, where = reader(path, data)
-    vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
+    try:
+        vertices, polygons, where = reader(path, data)
+        with np.errstate(invalid="ignore"):  # of NaN that signal
+            vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
+        if not isinstance(polygons, np.ndarray):
+            polygons = _fans(path, polygons, where)
+    except (KeyError, ValueError, IndexError, OverflowError, struct.error) as error:
+        raise InputError(
+            f"{path}: broken or cut short ({type(error).__name__}: {error})."
+        ) from error
     if not len(polygons):
         raise InputError(
             f"{path}: holds {len(vertices) or 'no'} vertices and no faces; expected a triangle mesh."
             + (" Reconstruct a surface from the points first." if len(vertices) else "")
         )
-    return vertices, _triangles(path, polygons, len(vertices), where)
+    return vertices, _checked(path, polygons, len(vertices))
 
 
-def _triangles(path, polygons, n_vertices, where):
-    """Fans of triangles, (m, 3) int32, of checked polygons; `where(i)` names polygon i for messages."""
-    if not isinstance(polygons, np.ndarray):
-        sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
-        if sizes.min() == sizes.max() == 3:
-            polygons = np.array(polygons, np.int64)
-        else:
-            short = np.flatnonzero(sizes < 3)
-            if len(short):
-                raise InputError(
-                    f"{path}: {len(short)} of {len(sizes)} faces have fewer than 3 corners (first:"
-                    f" {where(short[0])} has {sizes[short[0]]}). Remove them or export the mesh again."
-                )
-            polygons = np.array(
-                [(p[0], p[i], p[i + 1]) for p in polygons for i in range(1, len(p) - 1)], np.int64
-            )
+def _fans(path, polygons, where):
+    """Triangles (m, 3) int64 of lists of corners; `where(i)` names polygon i for messages."""
+    sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
+    short = np.flatnonzero(sizes < 3)
+    if len(short):
+        raise InputError(
+            f"{path}: {len(short)} of {len(sizes)} faces have fewer than 3 corners (first:"
+            f" {where(short[0])} has {sizes[short[0]]}). Remove them or export the mesh again."
+        )
+    if (sizes == 3).all():
+        return np.array(polygons, np.int64).reshape(-1, 3)
+    return np.array(
+        [(p[0], p[i], p[i + 1]) for p in polygons for i in range(1, len(p) - 1)], np.int64
+    )
+
+
+def _checked(path, polygons, n_vertices):
+    """Triangles (m, 3) int32 whose corners are there."""
     beyond = (polygons < 0) | (polygons >= n_vertices)
     if beyond.any():
         rows = np.flatnonzero(beyond.any(axis=1))
@@ -172,22 +182,18 @@ def _read_ply(path, data):
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == [b"property"] and elements:
             elements[-1][2].append(words[1:])
-    try:
-        body = data[data.index(b"\n", end) + 1 :]
-        if form == b"ascii":
-            rows = _ply_ascii(elements, body)
-        else:
-            order = {b"binary_little_endian": "<", b"binary_big_endian": ">"}[form]
-            rows = _ply_binary(elements, body, order)
+    body = data[data.index(b"\n", end) + 1 :]
+    if form == b"ascii":
+        rows = _ply_ascii(elements, body)
+    else:
+        order = {b"binary_little_endian": "<", b"binary_big_endian": ">"}[form]
+        rows = _ply_binary(elements, body, order)
+    with np.errstate(invalid="ignore"):  # of NaN that signal
         vertices = np.stack(
             [np.asarray(rows[b"vertex"][axis], float) for axis in (b"x", b"y", b"z")], 1
         )
-        faces = rows.get(b"face", {})
-        polygons = faces.get(b"vertex_indices", faces.get(b"vertex_index", []))
-    except (KeyError, ValueError, IndexError, struct.error) as error:
-        raise InputError(
-            f"{path}: broken or cut short ({type(error).__name__}: {error})."
-        ) from error
+    faces = rows.get(b"face", {})
+    polygons = faces.get(b"vertex_indices", faces.get(b"vertex_index", []))
     return vertices, polygons, lambda i: f"face {i}"
 
 

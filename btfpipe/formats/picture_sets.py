@@ -7,6 +7,7 @@ from btfpipe.errors import InputError
 from btfpipe.formats.images import colours, is_mislabelled
 from btfpipe.sample.measurement import Measurement
 from btfpipe.sample.transfer import TRANSFERS
+from btfpipe.store import check_fact
 
 SETTINGS = "btfpipe.json"
 # What settings may be called; `title` and `layout` are for readers of the file alone, the last two for one format each.
@@ -103,9 +104,8 @@ def check_settings(settings, label):
     white, transfer = settings.get("white"), settings.get("transfer")
     density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
     for key, value in (("white", white), ("texels_per_mm", density)):
-        good = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e30
-        if value is not None and not good:
-            raise InputError(f"{label}: {key} is {value!r}; expected a positive number.")
+        if value is not None:
+            check_fact(value, "positive", f"{label}: {key}")
     if transfer is not None and transfer not in TRANSFERS:
         raise InputError(
             f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."

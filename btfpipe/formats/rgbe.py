@@ -79,7 +79,8 @@ def decode_rgbe(data, name):
         )
     values = np.ldexp(pixels[..., :3].astype(np.float32), pixels[..., 3:].astype(np.int32) - 136)
     if (exposure != 1).any():
-        values /= exposure.astype(np.float32)
+        with np.errstate(over="ignore"):  # shows in the picture
+            values /= exposure.astype(np.float32)
     if found[2] == b"X":
         values = values.swapaxes(0, 1)
     signs = {found[2]: found[1], found[5]: found[4]}
@@ -118,7 +119,7 @@ def _header(data, name):
                 raise InputError(
                     f"{name}: {line.decode('latin-1')!r} in its header; expected {count} positive numbers."
                 )
-            exposure *= factors
+            exposure = np.clip(exposure * factors, 1e-30, 1e30)
     return end.end(), exposure
 
 

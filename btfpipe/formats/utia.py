@@ -188,7 +188,8 @@ def _to_rgb(picture, colour, label):
         values = colours(picture, label)
     if colour == "rgb" and not named:
         return values
-    converted = xyz_to_rgb(values)
+    with np.errstate(over="ignore", invalid="ignore"):  # shows in the picture
+        converted = xyz_to_rgb(values)
     if values.dtype != np.float16 or not np.isfinite(values).all():
         return converted.astype(values.dtype)
     largest = float(np.abs(converted).max())

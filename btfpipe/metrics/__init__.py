@@ -30,7 +30,8 @@ def raw_bytes(appearance):
     Of a Model: those of the Sample it was made from, taken for 8-bit if its file does not say.
     """
     codes = getattr(appearance, "codes", None)
-    if codes is None and "sample_bytes" in appearance.about:
-        return appearance.about["sample_bytes"]
+    said = None if codes is not None else appearance.about.get("sample_bytes")
+    if isinstance(said, int) and said > 0:
+        return said
     each = 3 if codes is None or codes.dtype.itemsize == 1 else 6
     return each * appearance.n_pairs * appearance.shape[0] * appearance.shape[1]

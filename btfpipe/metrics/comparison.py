@@ -57,7 +57,10 @@ def white_level(sample):
         return sample.scale, "code 255; the absolute scale is unknown"
     chosen = np.unique(np.linspace(0, sample.n_pairs - 1, _WHITE_PICTURES).astype(int))
     white = float(np.quantile(sample.pictures(chosen), _WHITE_QUANTILE))
-    return white or 1.0, "the 99.9 % quantile of the values; the absolute scale is unknown"
+    return (
+        white if white > 0 else 1.0,
+        "the 99.9 % quantile of the values; the absolute scale is unknown",
+    )
 
 
 class Comparison:

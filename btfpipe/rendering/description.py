@@ -30,7 +30,6 @@ def read_description(path, bindings=None):
         (a number that is not finite among them), there is no light, a placeholder has no binding, or a file does
         not exist.
     """
-    import jsonschema
     import yaml
 
     path = Path(path)
@@ -38,7 +37,7 @@ def read_description(path, bindings=None):
     schema = yaml.safe_load(
         resources.files("btfpipe.rendering").joinpath("scene.schema.yaml").read_text("utf-8")
     )
-    errors = list(jsonschema.Draft202012Validator(schema).iter_errors(scene))
+    errors = list(description.validator(schema).iter_errors(scene))
     if errors:
         raise InputError(f"{path}: {_explain(errors[0])}")
     if not scene["lights"]:

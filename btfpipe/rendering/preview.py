@@ -46,7 +46,9 @@ def tone_map(picture, exposure=1.0, filmic=False):
     filmic : bool
         Bend highlights to white (Narkowicz's fit of the ACES curve) instead of clipping them.
     """
-    colour = np.maximum(np.asarray(picture[..., :3], np.float32) * np.float32(exposure), 0)
+    factor = np.float32(min(exposure, float(np.finfo(np.float32).max)))
+    with np.errstate(over="ignore"):  # white, too
+        colour = np.maximum(np.asarray(picture[..., :3], np.float32) * factor, 0)
     if filmic:
         colour = np.minimum(colour, 1e6)  # white long before, and its square is still a number
         colour = colour * (2.51 * colour + 0.03) / (colour * (2.43 * colour + 0.59) + 0.14)
@@ -81,7 +83,7 @@ def show_layer(channels, layer, name):
             f"{name}: has no channel {missing[0]!r}, which the layer {layer} needs; it has"
             f" {', '.join(channels)}."
         )
-    planes = np.stack([np.asarray(channels[c], np.float32) for c in needs], axis=-1)
+    planes = _stacked(channels, needs, name).astype(np.float64)
     if layer == "alpha":
         shown = np.repeat(planes, 3, axis=-1)
     elif layer == "depth":
@@ -127,8 +129,18 @@ def colour_of(channels, name):
         raise InputError(
             f"{name}: has no channel {missing[0]!r}; it has {', '.join(channels)}. Expected a rendered picture."
         )
-    wanted = [*"RGB", *(["A"] if "A" in channels else [])]
-    return np.stack([np.asarray(channels[c], np.float32) for c in wanted], axis=-1)
+    return _stacked(channels, [*"RGB", *(["A"] if "A" in channels else [])], name)
+
+
+def _stacked(channels, wanted, name):
+    """Some channels (rows, cols, n) float32, all finite."""
+    planes = np.stack([np.asarray(channels[c], np.float32) for c in wanted], axis=-1)
+    bad = planes.size - np.count_nonzero(np.isfinite(planes))
+    if bad:
+        raise InputError(
+            f"{name}: holds {bad} NaN or infinite values in {', '.join(wanted)}; mend or remove the picture."
+        )
+    return planes
 
 
 def sheet(pictures, columns=None, labels=None):
@@ -207,6 +219,11 @@ def sample_sheet(appearance, lights=6, views=6):
     pictures : list of (rows, cols, 3) float32
     labels : list of str
     columns : int
+
+    Raises
+    ------
+    InputError
+        If values are not finite.
     """
     from btfpipe.directions import to_angles
 
@@ -218,7 +235,11 @@ def sample_sheet(appearance, lights=6, views=6):
             (appearance.view_directions, appearance.view_index),
         )
     )
-    pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
+    with np.errstate(over="ignore", invalid="ignore"):  # shows in the pictures
+        pictures = [np.asarray(appearance.pictures([pair])[0]) for pair in pairs]
+    bad = sum(not np.isfinite(picture).all() for picture in pictures)
+    if bad:
+        raise InputError(f"{bad} of the {len(pairs)} pictures to show hold non-finite values.")
     labels = [
         "light {:.0f} {:.0f}\nview {:.0f} {:.0f}".format(
             *np.degrees(to_angles(w_i[pair])), *np.degrees(to_angles(w_o[pair]))
@@ -298,7 +319,12 @@ def preview(
             )
         if layer != "colour":
             raise InputError(f"{paths[0]}: a Sample or Model has no layer {layer}.")
-        linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
+        try:
+            linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
+        except InputError as error:
+            if str(paths[0]) in str(error):
+                raise
+            raise InputError(f"{paths[0]}: {error}") from error
         columns = columns or columns_found
     else:
         channels = [read_channels(p) for p in paths]

@@ -49,8 +49,6 @@ def describe_container(reader, report=lambda done, total: None):
             sample = Sample.from_reader(reader)
         except InputError as error:
             problems.append(str(error))
-        except KeyError as error:
-            problems.append(f"{reader.path}: its description lacks {error}.")
         else:
             description["sample"] = describe_sample(sample, report)
             problems += description["sample"].pop("problems")

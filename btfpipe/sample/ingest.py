@@ -107,6 +107,7 @@ def ingest(
     dtype = first.dtype if first.dtype in (np.uint8, np.float16) else np.dtype(np.float32)
     convert = _converter(first.dtype, dtype, curve, (rows, cols), texels, toroidal)
     table = decode_table(np.uint8, curve) if eight_bit else None
+    curved = first.dtype.kind == "f" and curve != "linear"  # which takes large values beyond any
     full = _FULL.get(first.dtype)
     same = (
         eight_bit and (rows, cols) == texels
@@ -122,6 +123,8 @@ def ingest(
             if full and not same and picture.max() == full:
                 clipped.append(_count_clipped(picture, full))
             pictures[slot] = convert(picture)
+            if curved:
+                _require_finite(pictures[slot], measurement.names[pair])
         if full and same and pictures.max() == full:
             clipped = [_count_clipped(p, full) for p in pictures if p.max() == full]
         if mask is not None:
@@ -147,6 +150,9 @@ def ingest(
         texels_per_mm=_density(measurement, texels_per_mm, (rows, cols), texels),
         absolute=white is not None,
     )
+    for name in ("scale", "texels_per_mm"):
+        if getattr(sample, name) is not None:
+            store.check_fact(getattr(sample, name), "positive", f"{measurement.source}: {name}")
     facts = {
         "rows": texels[0],
         "cols": texels[1],
@@ -240,7 +246,10 @@ def _converter(source, dtype, curve, shape, texels, toroidal):
             return table[picture]
         if source == np.uint16:
             return decode(picture / 65535.0, curve).astype(np.float32)
-        return decode(picture, curve).astype(np.float32) if curve != "linear" else picture
+        if curve == "linear":
+            return picture
+        with np.errstate(over="ignore", invalid="ignore"):  # shows in the picture
+            return decode(picture, curve).astype(np.float32)
 
     if shape == texels:
         return (lambda picture: picture) if source == np.uint8 else linear
@@ -269,9 +278,10 @@ def _corrected(measurement, curve, clipped):
         full = _FULL.get(picture.dtype)
         if full and picture.max() == full:
             clipped[pair] = _count_clipped(picture, full)
-        linear = decode(picture / (full or 1), curve).astype(np.float32)
         dtype = np.float16 if picture.dtype == np.uint8 else np.float32
-        return measurement.correct(pair, linear).astype(dtype)
+        with np.errstate(over="ignore", invalid="ignore"):  # shows in the picture
+            linear = decode(picture / (full or 1), curve).astype(np.float32)
+            return measurement.correct(pair, linear).astype(dtype)
 
     return dataclasses.replace(
         measurement, read=read, transfer=lambda picture: "linear", correct=None
@@ -298,11 +308,13 @@ def _like_first(picture, first, pair, measurement):
             f" {first.dtype}. All pictures of a set must agree."
         )
     if picture.dtype.kind == "f":
-        bad = picture.size - int(np.isfinite(picture).sum())
-        if bad:
-            raise InputError(
-                f"{name}: holds {bad} NaN or infinite values; mend or remove the picture."
-            )
+        _require_finite(picture, name)
+
+
+def _require_finite(picture, name):
+    bad = picture.size - int(np.isfinite(picture).sum())
+    if bad:
+        raise InputError(f"{name}: holds {bad} NaN or infinite values; mend or remove the picture.")
 
 
 def _inside(region, shape, option, measurement):

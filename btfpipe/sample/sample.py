@@ -7,6 +7,8 @@ from btfpipe.errors import InputError
 from btfpipe.sample.appearance import Appearance, ShadingNeeds
 from btfpipe.sample.transfer import TRANSFERS, decode, decode_table
 
+_UNIT = 1e-4  # by how much the length of a direction may be off
+
 
 def check_index(name, index, count, pairs):
     """Refuse a table of `pairs` indices into `count` directions that has another length or leaves them."""
@@ -15,6 +17,17 @@ def check_index(name, index, count, pairs):
         raise InputError(
             f"{name} runs from {low} to {high} over {len(index)} pairs; expected 0 to {count - 1} over {pairs}."
         )
+
+
+def read_directions(reader):
+    """Lights and views (n, 3) of a file: unit vectors."""
+    tables = []
+    for name in ("light_directions", "view_directions"):
+        table = reader.require(name, (None, 3), "f", most=1 + _UNIT)
+        if not len(table) or np.abs(np.linalg.norm(table, axis=1) - 1).max() > _UNIT:
+            raise InputError(f"{reader.path}: {name} are not all unit vectors.")
+        tables.append(table)
+    return tables
 
 
 class Sample(Appearance):
@@ -97,23 +110,25 @@ class Sample(Appearance):
     @classmethod
     def from_reader(cls, reader):
         """As `open`, from a `store.Reader`."""
-        about = reader.about
         codes = reader.require("pictures", (None, None, None, 3), finite=False)
+        if not codes.size:
+            raise InputError(f"{reader.path}: pictures have shape {codes.shape}; there are none.")
         shape = codes.shape[1:3]
+        lights, views = read_directions(reader)
         return cls(
             codes,
-            reader.require("light_directions", (None, 3), "f"),
-            reader.require("view_directions", (None, 3), "f"),
+            lights,
+            views,
             reader.require("light_index", (len(codes),), "iu"),
             reader.require("view_index", (len(codes),), "iu"),
-            transfer=about["transfer"],
-            scale=about["scale"],
+            transfer=reader.fact("transfer", "text"),
+            scale=reader.fact("scale", "positive"),
             gain=reader.require("gain", (*shape, 3), "f") if "gain" in reader else None,
-            toroidal=about["toroidal"],
+            toroidal=reader.fact("toroidal", "flag"),
             mask=reader.require("mask", shape, "b") if "mask" in reader else None,
-            texels_per_mm=about["texels_per_mm"],
-            absolute=about["absolute"],
-            about=about,
+            texels_per_mm=reader.fact("texels_per_mm", "positive", None),
+            absolute=reader.fact("absolute", "flag"),
+            about=reader.about,
         )
 
     def facts(self):

@@ -6,7 +6,7 @@ from btfpipe.errors import InputError
 from btfpipe.sample.transfer import decode
 from btfpipe.simulation.meshes import MESHES
 from btfpipe.simulation.noise import fractal_noise
-from btfpipe.simulation.patch import Patch, height_field
+from btfpipe.simulation.patch import DEEPEST, Patch, height_field
 from btfpipe.simulation.reliefs import RELIEFS, Relief
 from btfpipe.simulation.tiles import TileMesh, smooth_corners, split
 
@@ -33,6 +33,12 @@ def build_patch(spec, files):
     rows, cols = spec["texels"]
     scale = spec["texels_per_mm"]
     size = (rows / scale, cols / scale)
+    for name, value in parameters.items():
+        if name.endswith("_mm") and value > DEEPEST * max(size):
+            raise InputError(
+                f"structure: {name} of {kind} is {value:g} over a tile of {size[0]:g} x {size[1]:g} mm; expected at most"
+                f" {DEEPEST} times its side."
+            )
     rng = np.random.default_rng([spec["seed"], 0])
     fine = spec["vertices_per_texel"]
     if kind == "obj":

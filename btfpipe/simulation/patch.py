@@ -7,6 +7,8 @@ import numpy as np
 from btfpipe.errors import InputError
 from btfpipe.sample.orientation import texels_to_step
 
+DEEPEST = 20  # sides of a tile: rays run through the copies around it, as many as it is deep
+
 
 @dataclass
 class Patch:
@@ -45,7 +47,8 @@ class Patch:
     f0: np.ndarray
 
     def __post_init__(self):
-        self.vertices = np.ascontiguousarray(self.vertices, np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # shows below
+            self.vertices = np.ascontiguousarray(self.vertices, np.float32)
         for name in ("normals", "albedo", "roughness", "f0"):
             array = np.ascontiguousarray(getattr(self, name), np.float32)
             if not np.isfinite(array).all():
@@ -55,6 +58,12 @@ class Patch:
         self.source = np.ascontiguousarray(self.source, np.int32)
         if not np.isfinite(self.vertices).all():
             raise InputError("the meso-structure's vertices hold NaN or infinite values.")
+        depth = float(np.ptp(self.vertices[:, 2].astype(float)))
+        if depth > DEEPEST * max(self.shape):
+            raise InputError(
+                f"the meso-structure is {depth:.3g} texels deep over a tile of {' x '.join(map(str, self.shape))}; expected at"
+                f" most {DEEPEST} times its side. Check heights and texels_per_mm."
+            )
 
     @property
     def table_faces(self):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from btfpipe.errors import InputError
 from btfpipe.simulation.noise import cellular, fractal_noise, scattered, smooth_noise, smoothstep
 
 
@@ -133,6 +134,8 @@ def cords(t, s, size, rng, *, count, height_mm, width, irregularity, fibres):
 
 def weave(t, s, size, rng, *, warp, weft, pattern, width, thickness_mm, crimp, twist, irregularity):
     """Threads over and under each other; the warp runs along t, the weft along s."""
+    if len({len(row) for row in pattern}) > 1:
+        raise InputError("structure: the rows of weave's pattern differ in length.")
     pattern = np.asarray(pattern, float) * 2 - 1  # 1: the warp lies on top
     bend = 0.22 * irregularity
     a_s = s * warp + bend * smooth_noise(rng, (4, 4), t, s)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from btfpipe.description import read_description
+from btfpipe.description import read_description, validator
 from btfpipe.directions import bonn81, from_angles, ubo2014
 from btfpipe.errors import InputError
 
@@ -29,12 +29,11 @@ def read_spec(path):
     InputError
         Names the key, what was found and what was expected.
     """
-    from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
 
     path = Path(path)
     spec = read_description(path, "a specification of a simulation")
-    problem = best_match(Draft202012Validator(schema()).iter_errors(spec))
+    problem = best_match(validator(schema()).iter_errors(spec))
     if problem is not None:
         key = ".".join(str(k) for k in problem.absolute_path) or "the specification"
         raise InputError(f"{path}: {key}: {problem.message}. See simulation.schema.yaml.")

@@ -3,6 +3,7 @@
 import numpy as np
 
 from btfpipe.errors import InputError
+from btfpipe.surface.surface import require_extent
 from btfpipe.surface.topology import edge_keys, half_edges, opposite_half_edges
 
 MERGE_DISTANCE = 1e-7  # of the bounding box's diagonal
@@ -30,7 +31,7 @@ def clean(vertices, faces, name="mesh"):
     Raises
     ------
     InputError
-        If a used vertex is not finite, nothing with an area is left, faces are not connected, an edge has more
+        If a used vertex is not finite, or lengths are beyond `require_extent`; if nothing with an area is left, faces are not connected, an edge has more
         than two faces, or the surface is one-sided.
     """
     repairs = {}
@@ -38,6 +39,9 @@ def clean(vertices, faces, name="mesh"):
     used[faces] = True
     repairs["unreferenced_vertices"] = int((~used).sum())
     _check_finite(vertices, used, name)
+    points = vertices[used]
+    if (points != points[:1]).any():  # what lies in one place is refused below
+        require_extent(points, name)
     vertices, faces, repairs["merged_vertices"] = _merge(vertices, faces)
     proper = (
         (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])

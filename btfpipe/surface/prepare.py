@@ -87,9 +87,12 @@ def prepare(
     levels = []
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
-        fine, place, weights = resample(
-            source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
-        )
+        try:
+            fine, place, weights = resample(
+                source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
+            )
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
         if i == 0:
             _check_count(name, len(place), wanted, len(euler))
         normals = source.normals(place, weights)
@@ -106,7 +109,10 @@ def prepare(
         )
         fallbacks.append(missed)
     report(n_levels, n_levels + 1)
-    _lay_field(levels, strokes, turn)
+    try:
+        _lay_field(levels, strokes, turn)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
     finest = levels[0]
     index = field.singularities(finest.faces, finest.normals, finest.tangents)
     pair = edges(finest.faces)

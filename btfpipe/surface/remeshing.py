@@ -7,17 +7,20 @@ Split, collapse and flip are the only changes of connectivity, so components, bo
 
 import numpy as np
 
+from btfpipe.errors import InputError
 from btfpipe.surface import _edges
 from btfpipe.surface.topology import edge_keys, half_edges, opposite_half_edges
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
 _MORE_ROUNDS = 6
+_MOST_GROWTH = 16  # times the vertices wanted and given; sound meshes stay below twice
 
 
 class _Mesh:
     """The tables that the compiled edits work on, with room to grow."""
 
-    def __init__(self, source):
+    def __init__(self, source, most):
+        self.most = most
         n, m = len(source.vertices), len(source.faces)
         self.n_vertices, self.n_faces = n, m
         opposite = opposite_half_edges(source.faces)
@@ -35,6 +38,11 @@ class _Mesh:
         self.points, self.flat = source.vertices.copy(), source.vertices.copy()
 
     def _grow(self):
+        if len(self.points) > self.most:
+            raise InputError(
+                f"edges are split without end (over {self.most} vertices): a corner sticks out far beyond its surroundings."
+                " Mend the mesh, or try without smoothing."
+            )
         for name in ("corner", "opposite", "feature", "leave", "kind", "points", "flat"):
             array = getattr(self, name)
             setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
@@ -116,8 +124,13 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
         Face of the input that holds each vertex.
     place_weights : (n, 3) float64
         Barycentric coordinates there. `source.lift` and `source.normals` give position and normal.
+
+    Raises
+    ------
+    InputError
+        If splitting edges does not shorten them.
     """
-    mesh = _Mesh(source)
+    mesh = _Mesh(source, _MOST_GROWTH * (n_vertices + len(source.vertices)))
     area = (
         0.5
         * np.linalg.norm(

@@ -1,10 +1,12 @@
 """Strokes: a small YAML file that says where the sample's right-hand direction should point."""
 
+import math
 from pathlib import Path
 
 from btfpipe.description import read_description
 from btfpipe.errors import InputError
 
+_LARGEST = 1e15  # of a coordinate; meshes reach no farther
 _FORM = "strokes: [{point: [x, y, z], vector: [x, y, z]}, ...]"
 
 
@@ -32,10 +34,12 @@ def _stroke(path, i, stroke):
         if not (
             isinstance(numbers, list)
             and len(numbers) == 3
-            and all(type(x) in (int, float) for x in numbers)
+            and all(type(x) in (int, float) and abs(x) <= _LARGEST for x in numbers)
         ):
-            raise InputError(f"{path}: stroke {i}: {key} is {numbers!r}; expected three numbers.")
-    if not any(stroke["vector"]):
+            raise InputError(
+                f"{path}: stroke {i}: {key} is {numbers!r:.80}; expected three numbers of at most {_LARGEST:g}."
+            )
+    if math.hypot(*stroke["vector"]) < 1 / _LARGEST:
         raise InputError(f"{path}: stroke {i}: vector has no length; give a direction.")
     return tuple(map(float, stroke["point"])), tuple(map(float, stroke["vector"]))
 

@@ -5,6 +5,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from btfpipe import store
+from btfpipe.errors import InputError
+
+_EXTENTS = (1e-15, 1e15)  # of a mesh, whose squares and their reciprocals are in single precision
+_UNIT = 1e-3  # by how much the length of a normal or tangent may be off
+_MOST_WEIGHT = (
+    1e3  # of a corner of the triangle that a vertex lies in, which may be a little outside
+)
+
+
+def require_extent(vertices, name):
+    """Refuse a mesh (n, 3) whose lengths, or places, are beyond what later stages multiply in single precision."""
+    low, high = _EXTENTS
+    reach = float(np.abs(vertices).max(initial=0))
+    extent = float(np.ptp(vertices, axis=0).max()) if reach < high and len(vertices) else 0.0
+    if not low < extent <= reach * 2 < 2 * high:
+        raise InputError(
+            f"{name}: spans {extent:.3g} and reaches {reach:.3g}; expected lengths between {low:g} and {high:g}. Export the"
+            " mesh in another unit."
+        )
 
 
 @dataclass
@@ -50,26 +69,33 @@ class Surface:
     @classmethod
     def open(cls, path):
         """Map a Surface from its file, checking indices and finiteness."""
-        from btfpipe.errors import InputError
-
         reader = store.read(path, "surface")
         levels = []
-        for i in range(reader.about["levels"]):
+        for i in range(reader.fact("levels", "count")):
             p = f"level{i}_"
             vertices = reader.require(p + "vertices", (None, 3), "f")
             n = len(vertices)
+            require_extent(vertices, f"{path}: level {i}")
             faces = reader.require(p + "faces", (None, 3), "i")
-            if len(faces) and (faces.min() < 0 or faces.max() >= n):
-                raise InputError(f"{path}: a face of level {i} names a vertex beyond {n - 1}.")
+            if not len(faces) or faces.min() < 0 or faces.max() >= n:
+                raise InputError(
+                    f"{path}: level {i} has no faces, or one that names a vertex beyond {n - 1}."
+                )
+            frame = []
+            for name in ("normals", "tangents"):
+                vectors = reader.require(p + name, (n, 3), "f", most=1 + _UNIT)
+                if np.abs(np.linalg.norm(vectors, axis=1) - 1).max() > _UNIT:
+                    raise InputError(f"{path}: {name} of level {i} are not all unit vectors.")
+                frame.append(vectors)
+            normals, tangents = (np.asarray(vectors, np.float32) for vectors in frame)
             level = Level(
-                vertices,
-                faces,
-                reader.require(p + "normals", (n, 3), "f"),
-                reader.require(p + "tangents", (n, 3), "f"),
+                np.asarray(vertices, np.float64), np.asarray(faces, np.int32), normals, tangents
             )
             if p + "parent_face" in reader:
                 level.parent_face = reader.require(p + "parent_face", (n,), "i")
-                level.parent_weights = reader.require(p + "parent_weights", (n, 3), "f")
+                level.parent_weights = reader.require(
+                    p + "parent_weights", (n, 3), "f", most=_MOST_WEIGHT
+                )
             levels.append(level)
         return cls(levels, reader.about, reader.digest)
 

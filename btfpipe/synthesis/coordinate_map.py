@@ -1,10 +1,33 @@
 """The CoordinateMap: which texel of the sample goes where, and turned by how much."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from btfpipe import store
+from btfpipe.errors import InputError
+
+_MOST_TEXELS = 1 << 24  # beyond, single precision does not tell texels from each other
+_MOST_WEIGHT = 1e3
+
+
+def _check_form(reader, elements):
+    """Refuse a map whose description has another form, or a plane of another size."""
+    domain, size = reader.about.get("domain"), reader.about.get("sample_shape")
+    if not isinstance(domain, dict) or ("plane" in domain) == ("surface" in domain):
+        raise InputError(f"{reader.path}: its description names neither a surface nor a plane.")
+    if "surface" in domain:
+        store.check_fact(domain["surface"], "text", f"{reader.path}: surface")
+    else:
+        store.check_fact(domain["plane"], "shape", f"{reader.path}: plane")
+        store.check_fact(domain.get("toroidal", False), "flag", f"{reader.path}: toroidal")
+        if math.prod(domain["plane"]) != elements:
+            raise InputError(
+                f"{reader.path}: {elements} coordinates for a plane of {' x '.join(map(str, domain['plane']))} texels."
+            )
+    if size is not None:
+        store.check_fact(size, "shape", f"{reader.path}: sample_shape")
 
 
 @dataclass
@@ -49,14 +72,17 @@ class CoordinateMap:
     def open(cls, path):
         """Map a CoordinateMap from its file, checking shapes and finiteness."""
         reader = store.read(path, "map")
-        row = reader.require("row", (None, None), "f")
+        row = reader.require("row", (None, None), "f", most=_MOST_TEXELS)
+        if not row.size:
+            raise InputError(f"{path}: holds no coordinates.")
+        _check_form(reader, row.shape[1])
         return cls(
             row,
-            reader.require("col", row.shape, "f"),
+            reader.require("col", row.shape, "f", most=_MOST_TEXELS),
             reader.require("angle", row.shape, "f"),
-            reader.about["texels_per_unit"],
+            reader.fact("texels_per_unit", "positive"),
             reader.about["domain"],
-            reader.require("weight", row.shape, "f"),
+            reader.require("weight", row.shape, "f", most=_MOST_WEIGHT),
             reader.require("sample_index", row.shape, "i"),
             reader.about,
         )

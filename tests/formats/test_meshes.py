@@ -123,6 +123,11 @@ def test_a_truncated_file_is_refused_or_read_as_far_as_it_is_whole(tmp_path_fact
         ("a.ply", b"solid\n", "has no PLY header"),
         ("a.ply", ascii_ply()[:-12], "broken or cut short"),
         ("a.ply", binary_ply("<", POLYGONS)[:-1], "broken or cut short"),
+        ("a.ply", ascii_ply().replace(b"vertex 5", b"vertex 5.5"), "broken or cut short"),
+        ("a.ply", ascii_ply().replace(b"vertex 5", b"vertex"), "broken or cut short"),
+        ("a.ply", binary_ply("<", POLYGONS).replace(b"vertex 5", b"vertex 99999999999999999999"), "broken or cut short"),
+        ("a.obj", b"v 0 0 0\nf 1 1 99999999999999999999\n", "broken or cut short"),
+        ("a.stl", b"solid x\nfacet\nvertex 0 0 0\nvertex 0 1\nvertex 1 1 0\nendsolid", "broken or cut short"),
         ("a.stl", b"solid x\nfacet\nvertex 0 0 0\n", "ends in the middle of a facet"),
         ("a.stl", b"x" * 100, "cut short or its ending is wrong"),
         ("a.txt", b"", "not a mesh that can be read"),
@@ -141,3 +146,12 @@ def test_what_is_written_is_read_back(tmp_path):
     vertices, faces = read_mesh(tmp_path / "a.obj")
     np.testing.assert_allclose(vertices, VERTICES, atol=5e-6)
     assert faces.tolist() == [list(t) for t in TRIANGLES]
+
+
+def test_a_signalling_nan_is_a_number_that_is_not_finite(tmp_path):
+    corners = np.zeros((1, 12), "<f4")
+    corners.view("<u4")[0, 3] = 0x7F800001
+    data = bytes(80) + b"\1\0\0\0" + corners.tobytes() + b"\0\0"
+    (tmp_path / "a.stl").write_bytes(data)
+    vertices, _ = read_mesh(tmp_path / "a.stl")
+    assert np.isnan(vertices[0, 0])

@@ -137,6 +137,11 @@ def test_every_cut_is_noticed(rng, pack):
             decode_rgbe(data[:length], "mine.hdr")
 
 
+def test_exposures_beyond_single_precision_make_infinite_values_and_no_warning():
+    head = b"#?RADIANCE\n" + b"EXPOSURE=1e-29\n" * 9 + b"\n-Y 1 +X 1\n"
+    assert np.isinf(decode_rgbe(head + b"\x80\x80\x80\xff", "a.hdr")).all()
+
+
 HEADER = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
 
 

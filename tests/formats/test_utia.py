@@ -162,6 +162,15 @@ def test_colours_beyond_half_precision_are_refused_and_not_made_infinite(tmp_pat
         measurement.read(0)
 
 
+@pytest.mark.parametrize("bad", [np.inf, 3e38])
+def test_colours_that_are_no_numbers_in_rgb_come_out_so_without_a_warning(tmp_path, bad):
+    xyz = np.full((4, 4, 3), 1, np.float32)
+    xyz[1, 1] = [bad, -bad, bad]
+    path = a_set(tmp_path / "set", {((0, 0), (0, 0)): xyz})
+    with utia.open_measurement(path) as measurement:
+        assert np.isfinite(measurement.read(0)).sum() < 48
+
+
 @pytest.mark.parametrize("spoil", ["nan", "cut", "missing", "size", "colour", "bomb", "outside"])
 def test_broken_sets_are_refused_by_name(tmp_path, rng, spoil):
     lights, views = [(0, 0), (30, 0)], [(0, 0), (45, 90)]

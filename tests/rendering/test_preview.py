@@ -168,3 +168,20 @@ def test_the_sheet_of_a_list_of_pairs_shows_pairs_that_are_there(make_sample):
     assert len(set(labels)) == 12
     stored = list(listed.pictures(slice(None)))
     assert all(any(np.array_equal(p, q) for q in stored) for p in pictures)
+
+
+@pytest.mark.parametrize("layer", ["colour", "depth"])
+def test_values_that_are_not_finite_are_refused(exr, btfpipe, tmp_path, layer):
+    path = exr("a.exr", np.nan)
+    if layer == "depth":
+        picture = np.full((4, 4, len(LAYERS)), np.inf, np.float32)
+        write_picture(path, picture, names=list(LAYERS))
+    refused = btfpipe("preview", path, "--layer", layer, "-o", tmp_path / "a.png", code=3).stderr
+    assert f"{path}: holds" in refused
+    assert "NaN or infinite values in" in refused
+
+
+@pytest.mark.parametrize("value", [1e-45, 3e38])
+def test_the_darkest_and_the_brightest_pictures_can_be_shown(exr, btfpipe, tmp_path, value):
+    btfpipe("preview", exr("a.exr", value), "-o", tmp_path / "a.png")
+    btfpipe("preview", exr("a.exr", value), "-f", "--exposure", 60, "-o", tmp_path / "a.png")

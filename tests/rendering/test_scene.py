@@ -40,6 +40,11 @@ LIGHT = {"type": "directional", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
         ({"objects": [{"plane": PLANE, "model": "none.npz"}]}, "there is no such file"),
         ({"objects": [{"plane": PLANE, "model": "$model"}]}, "--bind model=FILE"),
         ({"objects": [GREY | {"plane": PLANE | {"t": [2, 0, 0]}}]}, "objects[0]: plane: s and t"),
+        (
+            {"objects": [GREY | {"plane": PLANE | {"s": [1e155, 0, 0]}}]},
+            "objects[0].plane.s[0]: 1e+155 is greater than the maximum",
+        ),
+        ({"film": {"samples": 4.0}}, "film.samples: 4.0 is not of type 'integer'"),
         ({"film": {"width": 0}}, "film.width: 0 is less than the minimum"),
         ({"camera": {"type": "fisheye"}}, "camera.type: 'fisheye' is not one of"),
         ({"camera": {"type": "perspective"}}, "either position and target, or direction"),

@@ -322,3 +322,22 @@ def test_of_pairs_equally_near_the_normal_the_first_is_frontal():
             "x", *tables, order, 3 - order, [str(i) for i in order], read=int, transfer=str
         )
         assert frontal(measurement).names == [str(next(i for i in order if i != 3))]
+
+
+def test_values_that_a_curve_takes_beyond_any_are_refused_by_name(
+    make_measurement, ingest, tmp_path
+):
+    def change(members):
+        for name in members:
+            members[name] = encode_picture(np.full((6, 8, 3), 1e30, np.float32), ".exr")
+
+    path, _ = make_measurement(suffix=".exr", dtype=np.float32, change=change)
+    with pytest.raises(InputError, match=r"tl\d+.*holds 144 NaN or infinite"):
+        ingest(path, transfer="srgb")
+    assert not list(tmp_path.glob("s.sample.npz*"))
+
+
+@pytest.mark.parametrize("given", [{"white": 1e-320}, {"white": 1e35}, {"texels_per_mm": 1e300}])
+def test_a_scale_that_no_sample_may_have_is_refused(make_measurement, ingest, given):
+    with pytest.raises(InputError, match=r"set.zip: (scale|texels_per_mm) is .*positive number"):
+        ingest(make_measurement()[0], **given)

@@ -106,10 +106,24 @@ def test_table_of_pairs_gives_truth_at_any_direction(btfpipe, write_spec, tmp_pa
     [
         ({"sampels": 4}, "sampels"),
         ({"samples": 0}, "samples: 0 is less"),
+        ({"samples": 4.0}, "samples: 4.0 is not of type 'integer'"),
+        ({"texels_per_mm": 1e-300}, "texels_per_mm: 1e-300 is less"),
+        (
+            {"structure": {"bumps": {"count": [2, 2], "height_mm": 1000}}},
+            "spec.yaml: structure: height_mm of bumps is 1000 over a tile of 3 x 3 mm",
+        ),
+        (
+            {
+                "structure": {
+                    "weave": {"warp": 2, "weft": 2, "thickness_mm": 0.3, "pattern": [[1, 0], [0]]}
+                }
+            },
+            "rows of weave's pattern differ in length",
+        ),
         ({"texels": "big"}, "texels"),
         ({"structure": {"weave": {"warp": 4, "thickness_mm": 1}}}, "structure.weave: 'weft'"),
         ({"structure": {}}, "structure"),
-        ({"parts": {"ground": {"albedo": "#806040"}}}, "no material for 'bump'"),
+        ({"parts": {"ground": {"albedo": "#806040"}}}, "spec.yaml: parts: no material for 'bump'"),
         (
             {"parts": {"ground": {"albedo": "brown"}, "bump": {"albedo": "#ffffff"}}},
             "ground.albedo",

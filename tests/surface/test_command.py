@@ -79,6 +79,7 @@ def test_strokes_and_turn_are_taken_from_the_command_line(shapes, btfpipe, tmp_p
         ("strokes: []\nstrokes: []", "the key 'strokes' is given twice, in lines 1 and 2"),
         ("", "empty; expected strokes. Expected strokes: [{point"),
         ("strokes: [{point: [1, 0, 0], vector: [0, 0, 0]}]", "vector has no length"),
+        ("strokes: [{point: [1, 0, 0], vector: [1.0e+200, 0, 0]}]", "three numbers of at most 1e+15"),
         ("strokes: []", "not a list of at least one stroke"),
         ("stroke: 3", "unknown key 'stroke'"),
         ("- 3", "the file lacks strokes"),
@@ -182,3 +183,41 @@ def test_sample_meshes_need_no_repair_and_have_genus_0_and_1(shapes):
         assert not any(repairs.values())
         found, loops, _ = describe(faces, len(vertices))
         assert (found.tolist(), loops.tolist()) == ([euler], [0])
+
+
+@pytest.mark.parametrize("factor", [1e200, 1e-200])
+def test_a_mesh_in_an_impossible_unit_is_refused(shapes, btfpipe, tmp_path, factor):
+    vertices, faces = shapes.sphere(1)
+    mesh = tmp_path / "sphere.obj"
+    rows = [f"v {x * factor} {y * factor} {z * factor}" for x, y, z in vertices.tolist()]
+    rows += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    mesh.write_text("\n".join(rows))
+    refused = btfpipe("surface", mesh, "-o", tmp_path / "s.npz", code=3).stderr
+    assert f"{mesh}: spans" in refused
+    assert "spans" in btfpipe("info", mesh).stdout
+
+
+def test_a_spike_that_splitting_does_not_shorten_is_refused(btfpipe, tmp_path):
+    n = 4
+    places = [
+        (i / n, j / n, 0.1 * np.sin(i) * np.cos(j)) for i in range(n + 1) for j in range(n + 1)
+    ]
+    places[21] = (1, 0.25, 90.0001)
+    rows = ["v {:g} {:g} {:g}".format(*place) for place in places]
+    for i in range(n):
+        for j in range(n):
+            a = i * (n + 1) + j + 1
+            rows += [f"f {a} {a + n + 1} {a + 1}", f"f {a + 1} {a + n + 1} {a + n + 2}"]
+    mesh = tmp_path / "spike.obj"
+    mesh.write_text("\n".join(rows))
+    command = ["surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1]
+    assert f"{mesh}: edges are split without end" in btfpipe(*command, code=3).stderr
+
+
+def test_a_stroke_off_the_surface_is_refused_with_the_mesh(shapes, btfpipe, tmp_path):
+    mesh = shapes.obj(tmp_path / "sphere.obj", *shapes.sphere(1))
+    strokes = tmp_path / "strokes.yaml"
+    strokes.write_text("strokes: [{point: [9, 0, 0], vector: [1, 0, 0]}]")
+    command = ["surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1]
+    refused = btfpipe(*command, "--field", strokes, code=3).stderr
+    assert f"{mesh}: stroke 1: its point is" in refused
