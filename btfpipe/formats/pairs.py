@@ -3,8 +3,8 @@
 The list has a row a picture: ``name``, relative to the list, and one of three sets of columns (`COLUMNS`): angles in degrees;
 vectors to the light and to the eye; or positions of lamp and camera in cm, from the middle of the patch with x to the right, y
 up the picture and z along the normal. Other columns are left alone. CSV is comma-, semicolon- or tab-separated with a header;
-JSON is a list of objects, or an object with that list as ``pairs``. Settings (white, transfer, toroidal, texels_per_mm,
-patch_cm) stand in that object, or in ``btfpipe.json`` beside the list.
+JSON is a list of objects, or an object with that list as ``pairs``. Settings (white or scale, transfer, toroidal,
+texels_per_mm, patch_cm) stand in that object, or in ``btfpipe.json`` beside the list.
 
 From positions the pictures, which must be frontal ones of the patch alone, are brought to one distant light a pair, the one in
 the direction of the lamp from the patch's middle: see `correction`. Views are the camera's direction from there. How

@@ -12,7 +12,7 @@ from btfpipe.store import check_fact
 SETTINGS = "btfpipe.json"
 # What settings may be called; `title` and `layout` are for readers of the file alone, the last two for one format each.
 _KNOWN = (
-    "white", "transfer", "toroidal", "texels_per_mm", "title", "layout", "colour", "patch_cm",
+    "white", "scale", "transfer", "toroidal", "texels_per_mm", "title", "layout", "colour", "patch_cm",
 )  # fmt: skip
 _MOST_SETTINGS = 1 << 20  # bytes
 
@@ -61,6 +61,7 @@ def measurement_of_pictures(
         read=read,
         transfer=transfer,
         white=settings.get("white"),
+        scale=settings.get("scale") or 1.0,
         toroidal=settings.get("toroidal"),
         texels_per_mm=settings.get("texels_per_mm"),
         facts=facts,
@@ -100,12 +101,11 @@ def unknown_settings(settings):
 
 
 def check_settings(settings, label):
-    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
-    white, transfer = settings.get("white"), settings.get("transfer")
-    density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
-    for key, value in (("white", white), ("texels_per_mm", density)):
-        if value is not None:
-            check_fact(value, "positive", f"{label}: {key}")
+    """Refuse wrong values of those that all sets share; `label` is what messages call their file."""
+    transfer, toroidal = settings.get("transfer"), settings.get("toroidal")
+    for key in ("white", "scale", "texels_per_mm"):
+        if settings.get(key) is not None:
+            check_fact(settings[key], "positive", f"{label}: {key}")
     if transfer is not None and transfer not in TRANSFERS:
         raise InputError(
             f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."

@@ -2,7 +2,7 @@
 
 Names look like ``00008 tl000 pl000 tv030 pv030.jpg``: light and view, polar angle and azimuth, degrees; folders are
 named after the view. Only the keyed angles count. A set that was simulated carries ``btfpipe.json``, which says what
-Bonn's sets leave open: white, transfer, toroidal, texels_per_mm.
+Bonn's sets leave open: white or scale, transfer, toroidal, texels_per_mm.
 """
 
 import contextlib
