@@ -128,33 +128,6 @@ class HarmonicsModel(Model):
             spherical_harmonics(self.light_directions, self.light_terms).astype(np.float32),
         )
 
-    def feature_image(self, n=None):
-        """Vectors of the texels whose Euclidean distance is the Model's own, over all values of all pairs.
-
-        The coefficients are carried by the triangular factors of both bases, which have the bases' inner products.
-
-        Parameters
-        ----------
-        n : int, optional
-            Keep the n leading principal directions (no mean removed): the distance is then the nearest that n numbers give.
-
-        Returns
-        -------
-        (rows, cols, n) float32
-            As many as three times the terms by default.
-        """
-        views, lights = (np.linalg.qr(basis, mode="r") for basis in self._bases())
-        features = np.empty((*self.shape, 3 * self.view_terms * self.light_terms), np.float32)
-        for row in range(self.shape[0]):
-            features[row] = np.matmul(
-                views @ self.coefficients(row, slice(None)), lights.T
-            ).reshape(self.shape[1], -1)
-        if n is None:
-            return features
-        flat = features.reshape(-1, features.shape[2])
-        axes = np.linalg.eigh(flat.T @ flat)[1][:, ::-1]
-        return features @ axes[:, :n]
-
     @classmethod
     def shading_needs(cls, reader):
         from btfpipe.compression.harmonics_shading import MANY_LIGHTS, slice_bytes
