@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from btfpipe.compression import open_appearance
 from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import bonn81
 from btfpipe.metrics.comparison import matching_pairs
@@ -65,6 +66,20 @@ def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
         rtol=1e-3,
         atol=1e-3,
     )
+
+
+def test_a_file_of_factors_says_what_it_left_out(btfpipe, small, tmp_path):
+    factors = ("--format", "btf", "--channel-components", 3, 2, 2, "--json")
+    done = btfpipe("export", small, *factors, "-o", tmp_path / "s.btf")
+    btfpipe("ingest", tmp_path / "s.btf", "-o", tmp_path / "back.npz")
+    values = Sample.open(small).pictures(slice(None))
+    error = open_appearance(tmp_path / "back.npz").pictures(slice(None)) - values
+    relative = np.sqrt(np.sum(error**2) / np.sum(values**2))
+    assert json.loads(done.stdout)["relative_error"] == pytest.approx(relative, rel=1e-3)
+    again = btfpipe(
+        "export", tmp_path / "back.npz", "--format", "btf", "--json", "-o", tmp_path / "t.btf"
+    )
+    assert "relative_error" not in json.loads(again.stdout)
 
 
 def test_a_folder_of_others_is_left_alone_when_a_set_is_written(btfpipe, small, tmp_path):
