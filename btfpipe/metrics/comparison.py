@@ -24,24 +24,20 @@ def matching_pairs(model, sample):
         None if a light, a view or a combination of the Sample is missing from the Model (directions are the same
         within 0.05 degrees).
     """
-    index = []
-    for have, want, chosen in (
-        (model.light_directions, sample.light_directions, sample.light_index),
-        (model.view_directions, sample.view_directions, sample.view_index),
-    ):
-        # chords, as the arc cosine cannot tell small angles
-        chord = np.linalg.norm(np.asarray(want)[:, None] - np.asarray(have)[None], axis=2)
-        used = np.unique(chosen)
-        if chord.min(axis=1)[used].max() > _SAME_DIRECTION:
-            return None
-        index.append(chord.argmin(axis=1)[chosen])
-    lights = len(model.light_directions)
-    number = np.asarray(model.view_index, np.int64) * lights + model.light_index
-    order = np.argsort(number, kind="stable")
-    wanted = index[1].astype(np.int64) * lights + index[0]
-    place = np.minimum(np.searchsorted(number[order], wanted), len(number) - 1)
-    found = order[place]
-    return found if (number[found] == wanted).all() else None
+    from scipy.spatial import cKDTree
+
+    have, want = (
+        np.concatenate(
+            [a.light_directions[a.light_index], a.view_directions[a.view_index]],
+            axis=1,
+            dtype=np.float64,
+        )
+        for a in (model, sample)
+    )
+    found = cKDTree(have).query(want)[1]
+    # chords, as the arc cosine cannot tell small angles
+    chords = np.linalg.norm((want - have[found]).reshape(-1, 2, 3), axis=2)
+    return found if chords.max() <= _SAME_DIRECTION else None
 
 
 def white_level(sample):

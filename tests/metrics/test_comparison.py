@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from btfpipe.compression.svd import compress_svd
-from btfpipe.directions import bonn81
+from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
 from btfpipe.metrics import psnr, relative_error, rmse, ssim, to_display
 from btfpipe.metrics.comparison import compare, matching_pairs, white_level
@@ -120,6 +120,19 @@ def test_pairs_are_found_by_direction_not_by_number(make_sample, rng):
     shuffled.light_index = np.argsort(turned)[sample.light_index[chosen]]
     np.testing.assert_array_equal(matching_pairs(sample, shuffled), chosen)
     assert compare(sample, shuffled).overall()["linear"]["rmse"] == 0
+
+
+def test_pairs_of_a_long_list_are_found_in_little_memory(rng, peak_bytes):
+    count = 1500
+    w_i, w_o = (from_angles(rng.uniform(0, 1.4, count), rng.uniform(0, 6, count)) for _ in range(2))
+    w_o[7] = w_o[3]  # a view that two pairs share and that is there twice
+    index = np.arange(count)
+    sample = Sample(np.zeros((count, 1, 1, 3), np.uint8), w_i, w_o, index, index)
+    turned = subset(sample, index[::-1])
+    matching_pairs(sample, sample)  # imports
+    with peak_bytes() as peak:
+        np.testing.assert_array_equal(matching_pairs(sample, turned), index[::-1])
+    assert peak() < 4 << 20
 
 
 def test_a_missing_direction_or_pair_is_noticed(make_sample):
