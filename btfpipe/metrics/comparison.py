@@ -5,7 +5,14 @@ import math
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.metrics.kernels import N_SUMS, WINDOW, encode_table, ssim_pictures, sum_pictures
+from btfpipe.metrics.kernels import (
+    N_SUMS,
+    WINDOW,
+    encode_table,
+    ssim_pictures,
+    sum_pictures,
+    whole_windows,
+)
 from btfpipe.metrics.pictures import psnr
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
@@ -67,7 +74,8 @@ class Comparison:
     rmse, relative_error : (pairs,) float64
         Linear; see `btfpipe.metrics.rmse`.
     display_rmse, ssim : (pairs,) float64
-        In the display domain; SSIM of the luma, not a number for pictures under 11 texels.
+        In the display domain; SSIM of the luma, over windows of valid texels: not a number if there is none, as in pictures
+        under 11 texels.
     white : float
         Peak of the linear PSNR, white of the display domain.
     """
@@ -156,7 +164,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     ----------
     model : Appearance
     sample : Sample
-        The reference. Its valid texels count; its white is the peak.
+        The reference; its white is the peak. Texels count that are valid in both.
     interpolation : str, optional
         See `model_pictures`.
     threads : int
@@ -171,7 +179,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     Raises
     ------
     InputError
-        If the sizes differ, or as `model_pictures`.
+        If the sizes differ, if no texel is valid in both, or as `model_pictures`.
     """
     if tuple(model.shape) != tuple(sample.shape):
         raise InputError(
@@ -180,13 +188,17 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
         )
     rows, cols = sample.shape
     texels = rows * cols
-    mask = np.ones((rows, cols), bool) if sample.mask is None else np.asarray(sample.mask, bool)
+    mask = np.ones((rows, cols), bool)
+    for who in (sample, model):
+        if who.mask is not None:
+            mask &= who.mask
     if not mask.any():
-        raise InputError("the sample has no valid texel.")
+        raise InputError("no texel is valid in both the model and the sample.")
     white = white_level(sample)[0]
     over_white = np.float32(min(1 / white, float(np.finfo(np.float32).max)))
     table = encode_table()
     pictures = model_pictures(model, sample, interpolation)
+    windows = whole_windows(mask) if min(rows, cols) >= WINDOW else None
     sums = np.empty((sample.n_pairs, N_SUMS))
     ssim = np.full(sample.n_pairs, np.nan)
 
@@ -196,8 +208,8 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
             other = np.ascontiguousarray(pictures(pairs)).reshape(-1, texels, 3)
         lumas = np.empty((2, len(reference), texels), np.float32)
         sum_pictures(reference, other, mask.ravel(), over_white, table, sums[pairs], *lumas)
-        if min(rows, cols) >= WINDOW:
-            ssim_pictures(*lumas.reshape(2, -1, rows, cols), mask, ssim[pairs])
+        if windows is not None:
+            ssim_pictures(*lumas.reshape(2, -1, rows, cols), windows, ssim[pairs])
         return pairs.stop
 
     with single_threaded_blas():
