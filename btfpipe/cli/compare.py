@@ -104,16 +104,23 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             )
             files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
+        skipped = {}  # settings by method and reason, which is said once
         for row in rows:
             options = " ".join(
                 f"{flag(name)} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
                 for name, value in row["options"].items()
             )
-            what = row.get("skipped") or (
-                f"{row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
-                f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s"
+            name = f"{row['method']} {options or 'by default'}"
+            if "skipped" in row:
+                skipped.setdefault((row["method"], row["skipped"]), []).append(name)
+                continue
+            click.echo(
+                f"{name}: {row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
+                f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s",
+                err=True,
             )
-            click.echo(f"{row['method']} {options}: {what}", err=True)
+        for (_, reason), names in skipped.items():
+            click.echo(f"skipped: {', '.join(names)}: {reason}", err=True)
     return {"inputs": [path], **facts}
 
 
