@@ -38,13 +38,15 @@ def btfpipe():
 
 @pytest.fixture
 def peak_bytes():
-    """``with peak_bytes() as peak:`` and ``peak()`` is the most that Python and numpy held at once inside."""
+    """``with peak_bytes() as peak:`` and then ``peak[0]`` is the most that Python and numpy held at once inside."""
 
     @contextlib.contextmanager
     def watch():
+        peak = []
         tracemalloc.start()
         try:
-            yield lambda: tracemalloc.get_traced_memory()[1]
+            yield peak
+            peak.append(tracemalloc.get_traced_memory()[1])
         finally:
             tracemalloc.stop()
 
