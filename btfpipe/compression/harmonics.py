@@ -304,7 +304,7 @@ class _Fit:
 
 
 def supported(directions, most=None):
-    """The largest number of terms, all orders of a degree together and no more than `most`, that directions (n, 3) tell apart."""
+    """The largest number of terms, all orders of a degree together, that directions (n, 3) tell apart; no more than `most`."""
     best = 1
     count = len(directions) if most is None else min(len(directions), most)
     for degree in range(1, math.isqrt(count)):
