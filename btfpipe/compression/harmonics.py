@@ -240,7 +240,7 @@ class _Fit:
         count = len(basis)
         if terms > count:
             raise InputError(
-                f"{terms} terms over {count} {what}: more than there are. {_supported(directions)} terms are"
+                f"{terms} terms over {count} {what}: more than there are. {supported(directions)} terms are"
                 f" what these directions support."
             )
         weights = np.broadcast_to(weights, count)
@@ -252,7 +252,7 @@ class _Fit:
         if not kept.all():
             self.warning = (
                 f"the {count} {what} tell only {int(kept.sum())} of {terms} harmonics apart; the rest is left at"
-                f" the least energy ({_supported(directions)} terms are what these directions support)"
+                f" the least energy ({supported(directions)} terms are what these directions support)"
             )
         self.basis = basis.astype(np.float32)
         self.mirrored = np.float32(4 * np.pi / count)
@@ -276,10 +276,11 @@ class _Fit:
         return np.matmul(self.turn, projected)
 
 
-def _supported(directions):
-    """The largest number of terms, all orders of a degree together, that the directions tell apart."""
+def supported(directions, most=None):
+    """The largest number of terms, all orders of a degree together, that directions (n, 3) tell apart; no more than `most`."""
     best = 1
-    for degree in range(1, math.isqrt(len(directions))):
+    count = len(directions) if most is None else min(len(directions), most)
+    for degree in range(1, math.isqrt(count)):
         singular = np.linalg.svd(
             spherical_harmonics(directions, (degree + 1) ** 2), compute_uv=False
         )

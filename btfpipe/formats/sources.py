@@ -20,10 +20,8 @@ FORMATS = {
     "ptm": Format("btfpipe.formats.ptm", "read_model", ("transfer",)),
     "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
     "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),
-    "utia": Format(
-        "btfpipe.formats.utia", "open_measurement", ("pairs", "frontal", "directions", "colour")
-    ),
-    "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs", "frontal")),
+    "utia": Format("btfpipe.formats.utia", "open_measurement", ("pairs", "directions", "colour")),
+    "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs",)),
     "curet": Format("btfpipe.formats.curet", "open_measurement", ("sample_number",)),
     "picture": Format("btfpipe.formats.pictures", "open_measurement", ()),
 }
