@@ -30,6 +30,7 @@ from btfpipe.formats.picture_sets import (
     SETTINGS,
     beside,
     check_settings,
+    is_settings,
     measurement_of_pictures,
     settings_beside,
 )
@@ -113,7 +114,9 @@ def open_measurement(path, *, listing=None, patch_cm=None):
         lights, views = _directions(listed, label)
         facts = {
             "format": f"pairs ({listed.kind})",
-            "strays": sorted({*archive.names} - {*members, listed.member, beside(listed.member)}),
+            "strays": sorted(
+                {*archive.names} - {*members, listed.member, *beside(archive, listed.member)}
+            ),
         }
         lamps = None
         if listed.kind == "positions":
@@ -239,7 +242,7 @@ def _find(archive, wanted):
 
 
 def _may_be_list(name):
-    likely = name.lower().endswith(_ENDINGS) and PurePosixPath(name).name != SETTINGS
+    likely = name.lower().endswith(_ENDINGS) and not is_settings(name)
     return likely and not is_hidden(name)
 
 

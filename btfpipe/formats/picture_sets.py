@@ -81,15 +81,22 @@ def read_settings(archive, name):
     return check_settings(settings, label)
 
 
-def beside(member):
-    """Where the settings of a list of pictures are: in its folder."""
-    return (PurePosixPath(member).parent / SETTINGS).as_posix()
+def is_settings(name):
+    """Whether a file in a folder or zip is a set's settings, in letters of either case, as other systems change them."""
+    return PurePosixPath(name).name.lower() == SETTINGS
+
+
+def beside(archive, member):
+    """Names of the settings of a list of pictures, which are in its folder: one or none."""
+    folder = PurePosixPath(member).parent
+    found = (name for name in archive.names if is_settings(name))
+    return [name for name in found if PurePosixPath(name).parent == folder][:1]
 
 
 def settings_beside(archive, member):
     """Settings beside a list of pictures; none if there is no such file."""
-    name = beside(member)
-    return read_settings(archive, name) if name in archive.names else {}
+    names = beside(archive, member)
+    return read_settings(archive, names[0]) if names else {}
 
 
 def unknown_settings(settings):

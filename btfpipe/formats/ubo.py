@@ -16,7 +16,7 @@ from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.archive import COPY, is_hidden, names_in, open_archive
 from btfpipe.formats.images import Decoder
-from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures, read_settings
+from btfpipe.formats.picture_sets import is_settings, measurement_of_pictures, read_settings
 
 _ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _=:]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
@@ -67,7 +67,7 @@ class Listing:
         for name in archive.names:
             base = COPY.sub("", PurePosixPath(name).name)
             angles = parse_name(base)
-            if base == SETTINGS:
+            if is_settings(base):
                 self.settings = read_settings(archive, name)
             elif angles is None or is_hidden(name) or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)

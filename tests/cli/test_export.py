@@ -68,6 +68,21 @@ def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
     )
 
 
+@pytest.mark.parametrize("format_", ["ubo", "utia", "pairs", "rti"])
+def test_settings_in_upper_case_count(btfpipe, small, tmp_path, format_):
+    bright = Sample.open(small)
+    bright.codes = bright.codes * np.float32(8)
+    bright.save(small)
+    btfpipe("export", small, "--format", format_, "--suffix", ".png", "-o", tmp_path / "set")
+    (settings,) = (tmp_path / "set").glob("**/btfpipe.json")
+    settings.rename(settings.with_name("BTFPIPE.JSON"))
+    facts = json.loads(
+        btfpipe("ingest", tmp_path / "set", "-o", tmp_path / "b.npz", "--json").stdout
+    )
+    assert facts.get("strays") in ([], None)
+    assert Sample.open(tmp_path / "b.npz").pictures(slice(None)).max() > 4
+
+
 def test_a_file_of_factors_says_what_it_left_out(btfpipe, small, tmp_path):
     factors = ("--format", "btf", "--channel-components", 3, 2, 2, "--json")
     done = btfpipe("export", small, *factors, "-o", tmp_path / "s.btf")

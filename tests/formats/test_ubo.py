@@ -128,9 +128,10 @@ def test_a_source_without_pictures_says_what_names_it_expects(tmp_path):
             pass
 
 
-def test_settings_of_a_simulated_set_are_honoured(make_measurement):
+@pytest.mark.parametrize("name", ["btfpipe.json", "BTFPIPE.JSON"])
+def test_settings_of_a_simulated_set_are_honoured(make_measurement, name):
     settings = {"white": 0.5, "transfer": "linear", "toroidal": True, "texels_per_mm": 4.0}
-    path, _ = make_measurement(change=lambda m: m.update({"btfpipe.json": json.dumps(settings)}))
+    path, _ = make_measurement(change=lambda m: m.update({name: json.dumps(settings)}))
     with ubo.open_measurement(path) as measurement:
         assert (measurement.white, measurement.toroidal, measurement.texels_per_mm) == (
             0.5,
