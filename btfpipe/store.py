@@ -210,12 +210,6 @@ def check_writable(path, folder=False):
         raise InputError(_cannot_write(path, error)) from error
 
 
-def write_json(path, thing):
-    """Write `thing` as indented JSON, whole or not at all."""
-    with whole(path, "w") as file:
-        put_json(file, thing)
-
-
 def put_json(file, thing):
     """Write `thing` as indented JSON into an open text file."""
     json.dump(jsonable(thing), file, indent=2, allow_nan=False)

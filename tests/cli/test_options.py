@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from btfpipe import store
 from btfpipe.cli.options import FiniteFloat, input_file, naming, stage
 from btfpipe.errors import InputError, NumericalError
 
@@ -206,8 +205,3 @@ def test_the_package_runs_as_a_module():
         [sys.executable, "-m", "btfpipe", "--help"], capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith("Usage: btfpipe ")
-
-
-def test_json_of_a_report_holds_null_for_what_is_no_number(tmp_path):
-    store.write_json(tmp_path / "r.json", {"psnr": float("inf")})
-    assert json.loads((tmp_path / "r.json").read_text()) == {"psnr": None}
