@@ -77,6 +77,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
     """Compress a Sample in many ways: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression.sweep import draw_sweep, sweep
+    from btfpipe.files import whole
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
@@ -94,7 +95,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             definitions = _DEFINITIONS | {"white": comparison.white_level(sample)[1]}
             about = {"sample": {"file": path.name, "digest": store.digest(path)}}
             store.put_json(
-                files.enter_context(store.whole(out, "w")),
+                files.enter_context(whole(out, "w")),
                 about | facts | {"definitions": definitions},
             )
         if picture is not None:
@@ -102,7 +103,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
                 rows,
                 f"{path.name}: {' x '.join(map(str, sample.shape))} texels, {sample.n_pairs} pairs",
             )
-            files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
+            files.enter_context(whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
         for row in rows:
             options = " ".join(
@@ -130,6 +131,7 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
     """Compare a Model with a Sample: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression import open_appearance
+    from btfpipe.files import whole
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
@@ -181,9 +183,9 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
                     for name, result in results.items()
                 },
             }
-            store.put_json(files.enter_context(store.whole(out, "w")), report)
+            store.put_json(files.enter_context(whole(out, "w")), report)
         if picture is not None:
-            files.enter_context(store.whole(picture)).write(sheet)
+            files.enter_context(whole(picture)).write(sheet)
     for name, result in overall.items():
         linear, display = result["linear"], result["display"]
         if not quiet:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe import __version__, store
+from btfpipe import __version__, files, store
 from btfpipe.errors import BtfError, InputError
 from btfpipe.parallel import available_threads
 
@@ -109,7 +109,7 @@ def stage(out="required", *, outputs=(), folder=False):
             start = time.perf_counter()
             try:
                 for target in targets:
-                    store.check_writable(target, folder)
+                    files.check_writable(target, folder)
                 facts = command(**{k: v for k, v in common.items() if k in takes}, **kwargs)
                 inputs = [_input(path) for path in facts.pop("inputs", [])]
                 text = facts.pop("text", None)
