@@ -1,11 +1,12 @@
 """Writing files and folders whole or not at all.
 
+Links are followed: what they point to is replaced, not they. Devices, pipes and the like are not replaced.
+
 A file is written as ``NAME.btfpipe-XXXXXXXX.part`` beside its target and moved into place when complete. What a killed run
 left of that name, and nothing else, goes when the target is written again.
 """
 
 import contextlib
-import errno
 import fcntl
 import os
 import re
@@ -31,16 +32,16 @@ def whole(path, mode="wb"):
     Raises
     ------
     InputError
-        If the folder does not exist, cannot be written, or runs full.
+        If the folder does not exist, cannot be written, or runs full; if something else than a file is there.
     """
-    path = Path(path)
+    path = _target(path, stat.S_ISREG)
     part = _new_part(path)
     try:
         try:
             _remove_stale(path)
             file = part.open(mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8")
         except OSError as error:
-            raise InputError(_cannot_write(path, error)) from error
+            raise InputError(_cannot_write(path, error.strerror)) from error
         try:
             with file:
                 _lock(file.fileno())
@@ -49,7 +50,7 @@ def whole(path, mode="wb"):
         except OSError as error:
             if error.filename not in (None, str(part), str(path)):
                 raise  # some other file's trouble, met while writing this one
-            raise InputError(_cannot_write(path, error)) from error
+            raise InputError(_cannot_write(path, error.strerror)) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -62,9 +63,9 @@ def whole_folder(path):
     Raises
     ------
     InputError
-        If the folder around it does not exist, cannot be written, or runs full.
+        If the folder around it does not exist, cannot be written, or runs full; if something else than a folder is there.
     """
-    path = Path(path)
+    path = _target(path, stat.S_ISDIR)
     part = _new_part(path)
     try:
         _remove_stale(path)
@@ -79,9 +80,25 @@ def whole_folder(path):
         finally:
             os.close(handle)
     except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
+        raise InputError(_cannot_write(path, error.strerror)) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _target(path, *fits):
+    """Where a result called `path` goes: to the end of its links; refused if what is there `fits` by none of some tests of modes."""
+    target = Path(os.path.realpath(path))
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return target
+    except OSError as error:
+        raise InputError(_cannot_write(path, error.strerror)) from error
+    if not any(fit(mode) for fit in fits):
+        regular = "a file" if stat.S_ISREG(mode) else "a device, a pipe or the like"
+        found = "a folder" if stat.S_ISDIR(mode) else regular
+        raise InputError(_cannot_write(path, f"{found} is there"))
+    return target
 
 
 def _new_part(path):
@@ -129,8 +146,8 @@ def _remove_if_stale(part):
         os.close(handle)
 
 
-def _cannot_write(path, error):
-    return f"{path}: cannot be written ({error.strerror}); choose another --out or make room there."
+def _cannot_write(path, reason):
+    return f"{path}: cannot be written ({reason}); choose another --out or make room there."
 
 
 def check_writable(path, folder=False):
@@ -147,12 +164,10 @@ def check_writable(path, folder=False):
     InputError
         With the sentence that `whole` would give after the work.
     """
-    path = Path(path)
+    path = _target(path, stat.S_ISREG, *([stat.S_ISDIR] if folder else []))
     part = _new_part(path)
     try:
-        if path.is_dir() and not folder:
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         part.open("xb").close()
         part.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
+        raise InputError(_cannot_write(path, error.strerror)) from error

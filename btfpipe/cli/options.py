@@ -159,15 +159,19 @@ def _paths(kwargs, outputs):
 
 def refuse_inputs(target, inputs):
     """Refuse an output that is an input too, or a folder with one; for inputs that are found late, inside of others."""
-    whole = Path(target).resolve()
+    whole = _end_of_links(target)
     for path in inputs:
-        found = Path(path).resolve()
+        found = _end_of_links(path)
         if found == whole:
             raise click.UsageError(f"{target} is also the input; choose another name to write.")
         if found.is_relative_to(whole):
             raise click.UsageError(
                 f"{target} is a folder that holds the input {path}; choose another name to write."
             )
+
+
+def _end_of_links(path):
+    return Path(os.path.realpath(path))  # which stands links in a ring
 
 
 def _check_targets(targets, inputs, force):
@@ -177,7 +181,7 @@ def _check_targets(targets, inputs, force):
         if target.name in ("", ".."):
             raise click.UsageError(f"{str(target)!r} is no name of a file; give one to write.")
         refuse_inputs(target, inputs)
-        if target.resolve() in {other.resolve() for other in targets[:i]}:
+        if _end_of_links(target) in map(_end_of_links, targets[:i]):
             raise click.UsageError(f"{target} is to be written twice; choose two names.")
         if os.path.exists(target) and not force:
             raise click.UsageError(f"{target} exists; pass --force to replace it.")

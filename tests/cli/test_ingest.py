@@ -194,7 +194,7 @@ def test_an_output_that_is_a_folder_is_one_clear_sentence(btfpipe, make_measurem
     path, _ = make_measurement()
     (tmp_path / "s.npz").mkdir()
     result = btfpipe("ingest", path, "-o", tmp_path / "s.npz", "--force", code=3)
-    assert "cannot be written (Is a directory)" in result.stderr
+    assert "cannot be written (a folder is there)" in result.stderr
     assert [p.name for p in tmp_path.glob("s.npz*")] == ["s.npz"]
 
 

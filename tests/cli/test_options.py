@@ -1,6 +1,7 @@
 """What every command shares, seen through small commands made here and through real ones."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -153,7 +154,7 @@ def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
     made = command(lambda out: done.append(out))
     result = run(made, option, tmp_path / "folder", "--force")
     assert result.exit_code == 3
-    assert "folder: cannot be written (Is a directory)" in result.stderr
+    assert "folder: cannot be written (a folder is there)" in result.stderr
     result = run(made, option, tmp_path / ("n" * 300))
     assert result.exit_code == 3
     assert "cannot be written (File name too long)" in result.stderr
@@ -162,6 +163,20 @@ def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
     assert result.exit_code == 0
     assert len(done) == 1
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+def test_pipes_and_links_in_a_ring_are_found_before_the_work(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    done = []
+    made = command(lambda out: done.append(out))
+    for name in ("pipe", "a"):
+        result = run(made, "-o", tmp_path / name, "--force")
+        assert result.exit_code == 3
+        assert f"{tmp_path / name}: cannot be written" in result.stderr
+    assert not done
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_command_that_writes_folders_may_replace_one(tmp_path):
