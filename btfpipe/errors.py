@@ -1,5 +1,7 @@
 """The errors a user can act on, each with the exit code of the command line."""
 
+import contextlib
+
 
 class BtfError(Exception):
     """Something went wrong that the message explains (exit code 1)."""
@@ -17,3 +19,14 @@ class NumericalError(BtfError):
     """A method could not reach its tolerance (exit code 4)."""
 
     exit_code = 4
+
+
+@contextlib.contextmanager
+def naming(path):
+    """Put a file's name in front of what goes wrong in the block, unless the message has it."""
+    try:
+        yield
+    except BtfError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}") from error

@@ -96,5 +96,5 @@ def test_links_are_written_through_whether_they_dangle_or_not(tmp_path, write, t
 def test_links_in_a_ring_are_refused(tmp_path):
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    with pytest.raises(InputError, match="a: cannot be written .Too many levels"):
+    with pytest.raises(InputError, match=r"a: cannot be written \(Too many levels"):
         files.check_writable(tmp_path / "a")

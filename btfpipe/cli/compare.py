@@ -5,7 +5,8 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, progress, stage
+from btfpipe.errors import naming
 
 _WAYS = ("barycentric", "four", "nearest")
 _DEFINITIONS = {

@@ -2,7 +2,8 @@
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, Memory, flag, input_file, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, Memory, flag, input_file, progress, stage
+from btfpipe.errors import naming
 
 # As in btfpipe.compression.METHODS, which is not imported for --help.
 _METHODS = ("coded", "svd", "view-pca", "local-pca", "harmonics", "factored")

@@ -2,7 +2,8 @@
 
 import click
 
-from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, progress, stage
+from btfpipe.errors import naming
 
 # As in btfpipe.formats.targets, which is not imported for --help.
 _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")

@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from btfpipe import store
-from btfpipe.cli.options import FiniteFloat, flag, input_file, naming, progress, stage
-from btfpipe.errors import InputError
+from btfpipe.cli.options import FiniteFloat, flag, input_file, progress, stage
+from btfpipe.errors import InputError, naming
 
 MOST_TEXELS = 16384  # a side
 

@@ -263,14 +263,3 @@ def material_option(command):
 def flag(name):
     """An option as it is typed, from its name in Python."""
     return "--" + name.replace("_", "-")
-
-
-@contextlib.contextmanager
-def naming(path):
-    """Put a file's name in front of what goes wrong in the block, unless the message has it."""
-    try:
-        yield
-    except BtfError as error:
-        if str(path) in str(error):
-            raise
-        raise type(error)(f"{path}: {error}") from error

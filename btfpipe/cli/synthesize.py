@@ -4,7 +4,8 @@ import math
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, input_file, material_option, progress, stage
+from btfpipe.errors import naming
 
 _MOST_TEXELS = 16384  # a side
 

@@ -2,7 +2,8 @@
 
 import click
 
-from btfpipe.cli.options import input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import input_file, material_option, progress, stage
+from btfpipe.errors import naming
 
 
 @click.command()

@@ -107,10 +107,7 @@ class CodedModel(Model):
             for name in ("view", "light"):
                 count = len(getattr(source, f"{name}_directions"))
                 members[f"{name}_basis"] = reader.require(f"{name}_basis", (count, None), "f")
-        try:
-            return cls(members, source, about)
-        except InputError as error:
-            raise InputError(f"{reader.path}: {error}") from error
+        return cls(members, source, about)
 
     def pictures(self, pairs):
         texture = self.texture_factors.reshape(-1, self.n_terms)

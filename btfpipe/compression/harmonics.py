@@ -74,10 +74,7 @@ class HarmonicsModel(Model):
         if codes.dtype != np.uint8:
             raise InputError(f"{reader.path}: codes are {codes.dtype}; expected uint8.")
         for terms in codes.shape[3:]:
-            try:
-                highest_degree(terms)
-            except InputError as error:
-                raise InputError(f"{reader.path}: {error}") from error
+            highest_degree(terms)
         minimum = reader.require("minimum", codes.shape[2:], "f")
         maximum = reader.require("maximum", codes.shape[2:], "f")
         return cls(codes, minimum, maximum, source, reader.about)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from btfpipe.cli.options import FiniteFloat, input_file, naming, stage
-from btfpipe.errors import InputError, NumericalError
+from btfpipe.cli.options import FiniteFloat, input_file, stage
 
 
 def command(body, out="optional", **options):
@@ -183,14 +182,6 @@ def test_a_command_that_writes_folders_may_replace_one(tmp_path):
     (tmp_path / "set").mkdir()
     made = command(lambda out: None, folder=True)
     assert run(made, "-o", tmp_path / "set", "--force").exit_code == 0
-
-
-@pytest.mark.parametrize("kind", [InputError, NumericalError])
-def test_a_message_gets_its_file_once(kind):
-    with pytest.raises(kind, match=r"^a\.npz: too dark$"), naming("a.npz"):
-        raise kind("too dark")
-    with pytest.raises(kind, match=r"^a\.npz: too dark$"), naming("a.npz"):
-        raise kind("a.npz: too dark")
 
 
 def test_textons_and_synthesize_name_the_file_that_is_too_odd(btfpipe, make_sample, tmp_path):
