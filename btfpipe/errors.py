@@ -1,6 +1,7 @@
 """The errors a user can act on, each with the exit code of the command line."""
 
 import contextlib
+import math
 
 
 class BtfError(Exception):
@@ -16,7 +17,7 @@ class InputError(BtfError):
 
 
 class NumericalError(BtfError):
-    """A method could not reach its tolerance (exit code 4)."""
+    """A method did not converge, or met a matrix that it cannot solve (exit code 4)."""
 
     exit_code = 4
 
@@ -30,3 +31,14 @@ def naming(path):
         if str(path) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from error
+
+
+def amount(size, whole=math.ceil):
+    """Bytes as messages write them: whole MB, or KB below one."""
+    unit, name = (1 << 20, "MB") if size >= 1 << 20 else (1 << 10, "KB")
+    return f"{whole(size / unit)} {name}"
+
+
+def too_little(need, memory):
+    """What a message says after "they need" of work whose `need` of bytes exceeds --memory."""
+    return f"{amount(need)}; --memory allows {amount(memory, math.floor)}. Raise it"

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from btfpipe import __version__
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, amount
 from btfpipe.files import whole
 
 ALIGNMENT = 64
@@ -111,7 +111,7 @@ def scratch(shape, dtype):
             reserve(file.fileno(), 0, size) if reserve else file.truncate(size)
         except OSError as error:
             raise InputError(
-                f"{tempfile.gettempdir()}: no room for a temporary file of {math.ceil(size / (1 << 20))} MB"
+                f"{tempfile.gettempdir()}: no room for a temporary file of {amount(size)}"
                 f" ({error.strerror}); make room there, choose another folder by TMPDIR, or raise --memory."
             ) from error
         return np.memmap(file, dtype, "r+", shape=tuple(shape))

@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from btfpipe.errors import InputError, naming
+from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
 from btfpipe.surface.pyramid import parents
@@ -149,10 +149,9 @@ def _check_memory(name, n_vertices, memory):
     need = _PROCESS_BYTES + _BYTES_A_VERTEX * n_vertices
     if need > memory:
         fits = max(0, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
-        advice = f"ask for at most {fits} with --vertices" if fits >= 100 else "raise it"
+        advice = f", or ask for at most {fits} with --vertices" if fits >= 100 else ""
         raise InputError(
-            f"{name}: {n_vertices} vertices need about {need >> 20} MB; --memory allows {memory >> 20} MB:"
-            f" {advice}{', or raise it' if fits >= 100 else ''}."
+            f"{name}: {n_vertices} vertices need about {too_little(need, memory)}{advice}."
         )
 
 
