@@ -197,7 +197,8 @@ def _require_whole(path, listing, any_pairs):
         )
         raise InputError(
             f"{path}: holds no pictures with light and view angles in their names ({seen}); expected names such"
-            " as '00008 tl000 pl000 tv030 pv030.jpg'."
+            " as '00008 tl000 pl000 tv030 pv030.jpg', or beside the pictures a CSV with the columns name, theta_l, phi_l, theta_v,"
+            " phi_v, or an .lp list; a picture by itself is ingested by naming it."
         )
     if listing.duplicates:
         first, second = listing.duplicates[0]
