@@ -16,9 +16,10 @@ import time
 from pathlib import Path
 
 import click
+from numpy.linalg import LinAlgError
 
 from btfpipe import __version__, files, store
-from btfpipe.errors import BtfError, InputError
+from btfpipe.errors import BtfError, InputError, NumericalError
 from btfpipe.parallel import available_threads
 
 
@@ -65,7 +66,7 @@ def _common(out):
         click.option("--memory", type=Memory(), default="2G",
                      help="Working memory to stay within, such as 512M or 2G."),
         click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
-        click.option("-q", "--quiet", is_flag=True, help="No progress, no summary."),
+        click.option("-q", "--quiet", is_flag=True, help="No progress, no summary; warnings stay."),
     ]  # fmt: skip
     if out:
         options.insert(
@@ -123,6 +124,13 @@ def stage(out="required", *, outputs=(), folder=False):
                     err=True,
                 )
                 sys.exit(InputError.exit_code)
+            except LinAlgError as error:  # numpy's, which is scipy's too
+                click.echo(
+                    f"Error: {command.__name__} came upon a matrix that cannot be worked with ({error}); `btfpipe info` may"
+                    " say what is odd about the inputs, and other options of the method may get by.",
+                    err=True,
+                )
+                sys.exit(NumericalError.exit_code)
             summary = {"stage": command.__name__, "btfpipe": __version__, "inputs": inputs}
             if out is not None:
                 summary["out"] = str(out)
@@ -246,9 +254,27 @@ def progress(label, quiet=False):
     yield log
 
 
+def warn(*sentences):
+    """Print sentences on stderr, with --quiet too: they belong to the result."""
+    for sentence in sentences:
+        click.echo(f"Warning: {sentence.rstrip('.')}.", err=True)
+
+
+class _InputPath(click.Path):
+    """A file or folder that is there: no pipe, which can be read but once, and no device."""
+
+    def convert(self, value, param, ctx):
+        path = super().convert(value, param, ctx)
+        if not (path.is_file() or path.is_dir()):
+            self.fail(
+                f"{value} is a pipe or a device; expected a file. Save it as one first.", param, ctx
+            )
+        return path
+
+
 def input_file(**kwargs):
-    """Type of a command's input argument: any existing path."""
-    return click.Path(exists=True, path_type=Path, **kwargs)
+    """Type of a command's input argument: any file or folder that is there."""
+    return _InputPath(exists=True, path_type=Path, **kwargs)
 
 
 def material_option(command):
@@ -258,6 +284,35 @@ def material_option(command):
         metavar="NAME|NUMBER",
         help="Which material of a database to take, by name or number from 0.  [default: the first]",
     )(command)
+
+
+def material_taken(path, material):
+    """Say which material a command takes of a file, if it is a Model of several; warn unless it was named.
+
+    Returns
+    -------
+    dict
+        ``material``, its name, for the summary; nothing of a file with none to choose from.
+
+    Raises
+    ------
+    InputError
+        See `open_appearance`.
+    """
+    from btfpipe.compression import DATABASES, open_appearance
+
+    if not store.is_ours(path) or store.read(path).about.get("method") not in DATABASES:
+        return {}
+    model = open_appearance(path, material)
+    names = list(model.materials)
+    if len(names) == 1:
+        return {}
+    taken = names.pop(model.about["material"])
+    if material is None:
+        warn(
+            f"{path} holds {len(names) + 1} materials; took {taken!r}; --material takes another: {', '.join(names)}"
+        )
+    return {"material": taken}
 
 
 def flag(name):

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from btfpipe.cli.options import FiniteFloat, input_file, stage
+from btfpipe.cli.options import FiniteFloat, input_file, stage, warn
+from btfpipe.errors import NumericalError
 
 
 def command(body, out="optional", **options):
@@ -92,6 +93,51 @@ def test_too_little_memory_is_one_sentence():
     assert done.exit_code == 3
     assert done.stderr.startswith("Error: made needs more memory than there is")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_matrix_that_cannot_be_solved_is_one_sentence_and_exit_code_4(
+    btfpipe, make_sample, tmp_path, monkeypatch
+):
+    def fail(*args, **kwargs):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    make_sample(8, 8).save(tmp_path / "s.npz")
+    monkeypatch.setattr(np.linalg, "eigh", fail)
+    done = btfpipe("compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "-q", code=4)
+    assert done.stderr.startswith("Error: compress came upon a matrix that cannot be worked with")
+    assert "(Eigenvalues did not converge)" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["s.npz"]
+
+
+def test_a_vector_field_that_cannot_be_factorised_is_exit_code_4(monkeypatch):
+    import scipy.sparse.linalg
+
+    from btfpipe.surface import field
+
+    def fail(*args, **kwargs):
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(scipy.sparse.linalg, "splu", fail)
+    with pytest.raises(NumericalError, match=r"factorised \(Factor is exactly singular\)"):
+        field._factor(scipy.sparse.identity(3), 0.0)
+
+
+def test_a_pipe_is_no_input(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    result = run(command(lambda out: None), tmp_path / "pipe")
+    assert result.exit_code == 2
+    assert "pipe is a pipe or a device; expected a file" in result.stderr
+
+
+@pytest.mark.parametrize("options", [[], ["-q"], ["-q", "--json"]])
+def test_warnings_are_told_to_those_who_want_it_quiet_too(options):
+    def body(out):
+        warn("it is dark.", "it is cold")
+
+    done = run(command(body), *options)
+    assert "Warning: it is dark.\nWarning: it is cold.\n" in done.stderr
+    assert "Warning" not in done.stdout
 
 
 def test_an_input_is_never_an_output_even_with_force(tmp_path):
