@@ -5,10 +5,16 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import flag, input_file, material_option, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, material_taken, progress, stage
 from btfpipe.errors import naming
 
 _WAYS = ("barycentric", "four", "nearest")
+# What they are between the pairs of a list.
+_OF_LISTS = {
+    "barycentric": "nine nearest pairs",
+    "four": "four nearest pairs",
+    "nearest": "nearest pair",
+}
 _DEFINITIONS = {
     "linear": "values as stored, linear Rec. 709",
     "display": "linear values over white, clipped to [0, 1], sRGB curve",
@@ -137,6 +143,7 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
     from btfpipe.sample import Sample
 
     reference = Sample.open(sample)
+    taken = material_taken(model, material)
     stand_in = open_appearance(model, material)
     ways = _WAYS if "all" in ways else tuple(dict.fromkeys(ways))
     if not ways:
@@ -162,6 +169,8 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
         "ratio": raw / size,
     }
     overall = {name: result.overall() for name, result in results.items()}
+    words = {} if stand_in.is_product else _OF_LISTS
+    shown = {words.get(name, name): result for name, result in results.items()}
     if picture is not None:
         from btfpipe.formats.images import encode_picture
         from btfpipe.metrics.sheet import error_sheet
@@ -170,15 +179,16 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
         pictures_of = comparison.model_pictures(
             stand_in, reference, None if first == "own_pairs" else first
         )
-        sheet = encode_picture(error_sheet(reference, results, pictures_of), picture.suffix.lower())
+        sheet = encode_picture(error_sheet(reference, shown, pictures_of), picture.suffix.lower())
     with contextlib.ExitStack() as files:  # both appear, or neither
         if out is not None:
             report = {
-                "model": {"file": model.name, "digest": store.digest(model)}
-                | ({} if material is None else {"material": material}),
+                "model": {"file": model.name, "digest": store.digest(model)} | taken,
                 "sample": {"file": sample.name, "digest": store.digest(sample)},
                 **facts,
-                "definitions": _DEFINITIONS | {"white": white_is},
+                "definitions": _DEFINITIONS
+                | {"white": white_is}
+                | {name: words[name] for name in results if name in words},
                 "comparisons": {
                     name: overall[name] | {"per_pair": _per_pair(result, reference)}
                     for name, result in results.items()
@@ -189,14 +199,15 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
             files.enter_context(whole(picture)).write(sheet)
     for name, result in overall.items():
         linear, display = result["linear"], result["display"]
+        relative, ssim = linear["relative_error"], display["ssim"]
         if not quiet:
             click.echo(
-                f"{name}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
-                f" {100 * (linear['relative_error'] or 0):.2f} %; display PSNR {_db(display['psnr_db'])}, SSIM"
-                f" {display['ssim'] if display['ssim'] is None else round(display['ssim'], 4)}",
+                f"{words.get(name, name)}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
+                f" {'undefined' if relative is None else f'{100 * relative:.2f} %'}; display PSNR"
+                f" {_db(display['psnr_db'])}, SSIM {'none (under 11 texels)' if ssim is None else round(ssim, 4)}",
                 err=True,
             )
-    return {"inputs": [model, sample], **facts, "comparisons": overall}
+    return {"inputs": [model, sample], **taken, **facts, "comparisons": overall}
 
 
 def _db(value):
