@@ -5,31 +5,11 @@ import warnings
 
 import numpy as np
 import pytest
+from shared_meshes import torus
 
 from btfpipe.surface.remeshing import resample
 from btfpipe.surface.smooth_input import smooth_input
 from btfpipe.surface.topology import edges
-
-
-def bumpy_torus(around=96, across=48):
-    u, w = np.meshgrid(
-        2 * np.pi * np.arange(around) / around,
-        2 * np.pi * np.arange(across) / across,
-        indexing="ij",
-    )
-    inner = 0.4 + 0.04 * np.cos(5 * u) * np.sin(3 * w)
-    reach = 1 + inner * np.cos(w)
-    vertices = np.stack([reach * np.cos(u), inner * np.sin(w), -reach * np.sin(u)], 2).reshape(
-        -1, 3
-    )
-    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
-    k, m = (i + 1) % around, (j + 1) % across
-    a, b, c, d = (
-        x.ravel() for x in (i * across + j, k * across + j, k * across + m, i * across + m)
-    )
-    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(
-        np.int32
-    )
 
 
 def variation(vertices, faces):
@@ -43,7 +23,7 @@ def test_resampling_beside_gpytoolbox(benchmark, n):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its imports are deprecated by scipy
         gpytoolbox = pytest.importorskip("gpytoolbox")
-    vertices, faces = bumpy_torus()
+    vertices, faces = torus(96, 48, bumps=0.04)
     source = smooth_input(vertices, faces)
     resample(source, 500)  # compiled outside the figure
     rounds = 3 if n < 100_000 else 1

@@ -6,12 +6,13 @@ import time
 
 import numpy as np
 import pytest
+from shared_meshes import even_sphere
 
 from btfpipe.analysis import Features
 from btfpipe.analysis.neighbours import add_neighbour_lists
 from btfpipe.analysis.pyramid import halve, plain_features
 from btfpipe.analysis.textons import cluster, texton_level
-from btfpipe.surface import Level, Surface
+from btfpipe.surface import Surface
 from btfpipe.surface.flatten import PATCH, Flattener, Patches
 from btfpipe.synthesis import search
 from btfpipe.synthesis.exemplar import exemplar
@@ -44,30 +45,11 @@ def textons(side, levels=3, k=60):
     return add_neighbour_lists(features, k, threads=2)
 
 
-def sphere(n):
-    """A unit sphere of n even points, s to the east."""
-    from scipy.spatial import ConvexHull
-
-    i = np.arange(n) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
-    v = np.stack(
-        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1
-    )
-    faces = ConvexHull(v).simplices
-    corners = v[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("nd,nd->n", normal, corners.mean(axis=1)) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    east = np.cross([0, 0, 1], v)
-    east /= np.linalg.norm(east, axis=1, keepdims=True)
-    return Level(v, faces.astype(np.int32), v.astype(np.float32), east.astype(np.float32))
-
-
 def sphere_surface(n, levels):
     """A sphere and its pyramid; places on the coarser level are the nearest ones."""
     import igl
 
-    made = [sphere(n // 4**i) for i in range(levels)]
+    made = [even_sphere(n // 4**i) for i in range(levels)]
     for fine, coarse in itertools.pairwise(made):
         found = igl.point_mesh_squared_distance(
             fine.vertices, coarse.vertices, coarse.faces.astype(np.int64)
@@ -129,7 +111,7 @@ def test_distances_on_one_level(benchmark, side):
 
     The texture grows by full search; at every vertex each k chooses too, from the same surroundings.
     """
-    features, level = textons(side, levels=1), sphere(1500)
+    features, level = textons(side, levels=1), even_sphere(1500)
     mesh = Flattener(level, 1 / mean_edge(level))
     order = breadth_first(mesh)
     patches = mesh.squares(order, 5)

@@ -1,6 +1,8 @@
 """Fixtures that every test may use. Scenes are tiny and made in code."""
 
+import contextlib
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,23 @@ def btfpipe():
         return result
 
     return run
+
+
+@pytest.fixture
+def peak_bytes():
+    """``with peak_bytes() as peak:`` and then ``peak[0]`` is the most that Python and numpy held at once inside."""
+
+    @contextlib.contextmanager
+    def watch():
+        peak = []
+        tracemalloc.start()
+        try:
+            yield peak
+            peak.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+
+    return watch
 
 
 @pytest.fixture(scope="session")

@@ -156,6 +156,28 @@ def eigen_textures(appearance, *, seed=0, threads=1, memory=2 << 30):
     return textures, angular
 
 
+def feature_image(appearance, dimensions=None, *, seed=0, threads=1, memory=2 << 30):
+    """Vectors of the texels of any Appearance, whose Euclidean distance is that of the texels' values under all pairs.
+
+    Parameters
+    ----------
+    appearance : Appearance
+        An SVD Model is used as it is; of anything else an SVD of 40 terms is made first, which leaves its error out.
+    dimensions : int, optional
+        Keep only so many, of the largest extent.
+    seed, threads, memory
+        As in `texton_features`.
+
+    Returns
+    -------
+    (rows, cols, n) float32
+        Without a mean removed. Invalid texels repeat the nearest valid one.
+    """
+    textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
+    with single_threaded_blas():
+        return textures @ picture_weights(angular)[:, :dimensions]
+
+
 def picture_weights(angular):
     """A square root (n, n) of ``M``, the sum of ``A A^T`` over pictures and channels; columns by falling weight."""
     rows = np.asarray(angular, np.float64).reshape(-1, angular.shape[-1])

@@ -18,14 +18,14 @@ _OF_LISTS = {
 _DEFINITIONS = {
     "linear": "values as stored, linear Rec. 709",
     "display": "linear values over white, clipped to [0, 1], sRGB curve",
-    "rmse": "sqrt(mean((model - sample)^2)) over pairs, valid texels and channels",
+    "rmse": "sqrt(mean((model - sample)^2)) over pairs, texels valid in both, and channels",
     "psnr_db": "20 log10(peak / rmse), peak = white in linear and 1 in display; null: no error",
     "relative_error": "sqrt(sum((model - sample)^2) / sum(sample^2)), linear",
     "rmse_after_best_scale": "linear rmse of best_scale * model, for samples of unknown absolute scale",
     "ratio": "sample_bytes / bytes: pictures that MODEL stands for, 3 bytes a texel and pair (6 if half"
     " floats), over the bytes of its file",
-    "ssim": "Wang et al. 2004 on display luma, 11 x 11 Gaussian windows of 1.5 texels; mean over pairs;"
-    " null: under 11 texels",
+    "ssim": "Wang et al. 2004 on display luma, 11 x 11 Gaussian windows of 1.5 texels; mean over"
+    " pairs, of windows whose texels are all valid; null: there are none",
 }
 
 
@@ -112,16 +112,23 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             )
             files.enter_context(whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
+        skipped = {}  # settings by method and reason, which is said once
         for row in rows:
             options = " ".join(
                 f"{flag(name)} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
                 for name, value in row["options"].items()
             )
-            what = row.get("skipped") or (
-                f"{row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
-                f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s"
+            name = f"{row['method']} {options or 'by default'}"
+            if "skipped" in row:
+                skipped.setdefault((row["method"], row["skipped"]), []).append(name)
+                continue
+            click.echo(
+                f"{name}: {row['ratio']:.1f}:1, display PSNR {_db(row['display_psnr_db'])}, linear"
+                f" {_db(row['linear_psnr_db'])}, {row['seconds']:.1f} s",
+                err=True,
             )
-            click.echo(f"{row['method']} {options}: {what}", err=True)
+        for (_, reason), names in skipped.items():
+            click.echo(f"skipped: {', '.join(names)}: {reason}", err=True)
     return {"inputs": [path], **facts}
 
 

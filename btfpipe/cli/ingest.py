@@ -132,9 +132,8 @@ def ingest(source, format_, out, threads, quiet, **options):
     """
     from btfpipe.compression.model import Model
     from btfpipe.formats import sources
+    from btfpipe.sample import measurement as measurements
     from btfpipe.sample.ingest import ingest as ingest_measurement
-    from btfpipe.sample.measurement import frontal as nearest_only
-    from btfpipe.sample.measurement import with_cosine
 
     if (options["grey_card"] is None) != (options["grey_card_reflectance"] is None):
         raise click.UsageError("--grey-card and --grey-card-reflectance go together.")
@@ -151,10 +150,12 @@ def ingest(source, format_, out, threads, quiet, **options):
     if "transfer" in takes:
         own["transfer"] = options.pop("transfer")
     own = {key: value for key, value in own.items() if value not in (None, False)}
-    # every format of pictures takes these two; some by themselves
-    frontal, cosine = (
-        own.pop(key, None) if key not in takes else None for key in ("frontal", "cosine")
-    )
+    cosine = (
+        None if "cosine" in takes else own.pop("cosine", None)
+    )  # pictures of any format may say
+    frontal = options.pop("frontal")
+    if frontal and "pairs" in takes:
+        own["pairs"] = True  # one pair is a product, whatever the set lacks
     for key in own:
         if key not in takes:
             raise click.UsageError(
@@ -178,9 +179,9 @@ def ingest(source, format_, out, threads, quiet, **options):
         return told | _facts_of(opened)
     with opened as measurement, progress("pictures", quiet) as report:
         if cosine == "divided":
-            measurement = with_cosine(measurement)
+            measurement = measurements.with_cosine(measurement)
         if frontal:
-            measurement = nearest_only(measurement)
+            measurement = measurements.frontal(measurement)
         with naming(source):
             facts = ingest_measurement(
                 measurement, out, threads=threads, report=report, about=about, **options
@@ -191,7 +192,7 @@ def ingest(source, format_, out, threads, quiet, **options):
 
 # Options that some formats take and others do not.
 _OF_FORMATS = (
-    "pairs", "frontal", "directions", "colour", "listing", "patch_cm", "sample_number", "cosine",
+    "pairs", "directions", "colour", "listing", "patch_cm", "sample_number", "cosine",
 )  # fmt: skip
 
 

@@ -125,33 +125,6 @@ class HarmonicsModel(Model):
             spherical_harmonics(self.light_directions, self.light_terms).astype(np.float32),
         )
 
-    def feature_image(self, n=None):
-        """Vectors of the texels whose Euclidean distance is the Model's own, over all values of all pairs.
-
-        The coefficients are carried by the triangular factors of both bases, which have the bases' inner products.
-
-        Parameters
-        ----------
-        n : int, optional
-            Keep the n leading principal directions (no mean removed): the distance is then the nearest that n numbers give.
-
-        Returns
-        -------
-        (rows, cols, n) float32
-            As many as three times the terms by default.
-        """
-        views, lights = (np.linalg.qr(basis, mode="r") for basis in self._bases())
-        features = np.empty((*self.shape, 3 * self.view_terms * self.light_terms), np.float32)
-        for row in range(self.shape[0]):
-            features[row] = np.matmul(
-                views @ self.coefficients(row, slice(None)), lights.T
-            ).reshape(self.shape[1], -1)
-        if n is None:
-            return features
-        flat = features.reshape(-1, features.shape[2])
-        axes = np.linalg.eigh(flat.T @ flat)[1][:, ::-1]
-        return features @ axes[:, :n]
-
     @classmethod
     def shading_needs(cls, reader):
         from btfpipe.compression.harmonics_shading import MANY_LIGHTS, slice_bytes
@@ -264,7 +237,7 @@ class _Fit:
         count = len(basis)
         if terms > count:
             raise InputError(
-                f"{terms} terms over {count} {what}: more than there are. Pass --{what[:-1]}-harmonics {_supported(directions)}, which"
+                f"{terms} terms over {count} {what}: more than there are. Pass --{what[:-1]}-harmonics {supported(directions)}, which"
                 " is what these directions support."
             )
         weights = np.broadcast_to(weights, count)
@@ -276,7 +249,7 @@ class _Fit:
         if not kept.all():
             self.warning = (
                 f"the {count} {what} tell only {int(kept.sum())} of {terms} harmonics apart; the rest is left at"
-                f" the least energy ({_supported(directions)} terms are what these directions support)"
+                f" the least energy ({supported(directions)} terms are what these directions support)"
             )
         self.basis = basis.astype(np.float32)
         self.mirrored = np.float32(4 * np.pi / count)
@@ -300,10 +273,11 @@ class _Fit:
         return np.matmul(self.turn, projected)
 
 
-def _supported(directions):
-    """The largest number of terms, all orders of a degree together, that the directions tell apart."""
+def supported(directions, most=None):
+    """The largest number of terms, all orders of a degree together, that directions (n, 3) tell apart; no more than `most`."""
     best = 1
-    for degree in range(1, math.isqrt(len(directions))):
+    count = len(directions) if most is None else min(len(directions), most)
+    for degree in range(1, math.isqrt(count)):
         singular = np.linalg.svd(
             spherical_harmonics(directions, (degree + 1) ** 2), compute_uv=False
         )

@@ -6,13 +6,15 @@ import time
 from pathlib import Path
 
 from btfpipe.compression import compress
+from btfpipe.compression.harmonics import supported
 from btfpipe.errors import InputError
 from btfpipe.metrics import raw_bytes
 from btfpipe.metrics.comparison import compare
 
 # Settings that a sweep tries, by method: from the smallest file to the largest.
 SETTINGS = {
-    "coded": [{"ratio": ratio} for ratio in (400.0, 200.0, 100.0, 50.0, 25.0)],
+    # by default 100 : 1, or what a small sample's tables leave
+    "coded": [{"ratio": 400.0}, {"ratio": 200.0}, {}, {"ratio": 50.0}, {"ratio": 25.0}],
     "svd": [{"components": n} for n in (4, 8, 16, 32, 64, 128)],
     # of logarithms, the default; about as large as an SVD of as many terms as luminance has
     "factored": [{"channel_components": (n, n // 2, n // 2)} for n in (4, 8, 16, 32, 64, 128)],
@@ -32,7 +34,8 @@ def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progre
     ----------
     sample : Sample
     settings : dict, optional
-        By method a list of options of `compress`; `SETTINGS` by default.
+        By method a list of options of `compress`; `SETTINGS` by default. Harmonics are asked for as far as the directions
+        tell them apart.
     seed, threads, memory
         As for `compress`.
     on_progress : callable, optional
@@ -42,15 +45,14 @@ def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progre
     -------
     list of dict
         ``method``, ``options``, true ``bytes`` of the file, ``ratio`` to 3 bytes a texel and pair (6 for half floats), ``display_psnr_db``,
-        ``linear_psnr_db``, ``relative_error``, ``ssim``, ``seconds`` to compress; or ``skipped``, the reason why a
-        method cannot take the Sample.
+        ``linear_psnr_db``, ``relative_error``, ``ssim``, ``seconds`` to compress, and ``warnings`` if there are any; or
+        ``skipped``, the reason why a method cannot take the Sample.
     """
-    settings = SETTINGS if settings is None else settings
-    raw, total = raw_bytes(sample), sum(map(len, settings.values()))
-    rows = []
+    plan = _plan(sample, SETTINGS if settings is None else settings)
+    raw, rows = raw_bytes(sample), []
     with tempfile.TemporaryDirectory(prefix="btfpipe-") as folder:
         path = Path(folder) / "model.npz"
-        for method, options in ((m, o) for m, tried in settings.items() for o in tried):
+        for method, options in plan:
             row = {"method": method, "options": options}
             start = time.perf_counter()
             try:
@@ -61,6 +63,9 @@ def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progre
                 row["skipped"] = str(error)
             else:
                 row["seconds"] = round(time.perf_counter() - start, 3)
+                warnings = model.about.pop(
+                    "warnings", []
+                )  # no part of a file, as `compress` writes it
                 model.save(path)
                 size = path.stat().st_size
                 figures = compare(model, sample, threads=threads).overall()
@@ -71,11 +76,28 @@ def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progre
                     "linear_psnr_db": figures["linear"]["psnr_db"],
                     "relative_error": figures["linear"]["relative_error"],
                     "ssim": figures["display"]["ssim"],
-                }
+                } | ({"warnings": warnings} if warnings else {})
             rows.append(row)
             if on_progress is not None:
-                on_progress(len(rows), total)
+                on_progress(len(rows), len(plan))
     return rows
+
+
+def _plan(sample, settings):
+    """Each (method, options) to try, once."""
+    plan = []
+    for method, tried in settings.items():
+        for options in tried:
+            options = dict(options)
+            for name, directions in (
+                ("view_harmonics", sample.view_directions),
+                ("light_harmonics", sample.light_directions),
+            ):
+                if name in options:
+                    options[name] = supported(directions, options[name])
+            if (method, options) not in plan:
+                plan.append((method, options))
+    return plan
 
 
 def draw_sweep(rows, title=""):
@@ -103,8 +125,9 @@ def draw_sweep(rows, title=""):
     if axes.lines:
         axes.legend()
     ratios = [row["ratio"] for row in rows if "ratio" in row]
-    ticks = [t for t in (2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000) if ratios and min(ratios) / 1.5 < t < max(ratios) * 1.5]  # fmt: skip
-    axes.set_xticks(ticks, [f"{t}:1" for t in ticks])
+    steps = [step * 10.0**power for power in range(-3, 5) for step in (1, 2, 5)]
+    ticks = [t for t in steps if ratios and min(ratios) / 1.5 < t < max(ratios) * 1.5]
+    axes.set_xticks(ticks, [f"{t:g}:1" for t in ticks])
     axes.minorticks_off()
     data = io.BytesIO()
     figure.savefig(data, format="png", metadata={"Software": None})

@@ -33,7 +33,7 @@ from btfpipe.formats.compress_z import MAGIC, decompress
 from btfpipe.formats.curet_geometry import LARGEST_SHIFT, find_shifts, fit, outline, resample
 from btfpipe.formats.curet_writing import write_curet
 from btfpipe.formats.images import Decoder, colours, is_mislabelled
-from btfpipe.formats.picture_sets import SETTINGS
+from btfpipe.formats.picture_sets import is_settings
 from btfpipe.formats.ubo import parse_name
 from btfpipe.parallel import ordered_map
 from btfpipe.sample.measurement import Measurement
@@ -88,7 +88,7 @@ class Listing:
         for name in archive.names:
             path = PurePosixPath(COPY.sub("", name))
             base, parts = path.name, path.parts[:-1]
-            if base == SETTINGS:
+            if is_settings(base):
                 continue
             hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
             stem = _stem(base) if parse_name(base) is None else None

@@ -17,9 +17,9 @@ from btfpipe.formats.archive import is_zip, open_archive
 from btfpipe.formats.images import Decoder, is_mislabelled, open_picture
 from btfpipe.formats.meshes import ENDINGS, read_mesh
 from btfpipe.formats.picture_sets import unknown_settings
-from btfpipe.formats.ubo import Listing
+from btfpipe.formats.ubo import Listing, tables
 from btfpipe.parallel import ordered_map
-from btfpipe.sample.describe import describe_directions
+from btfpipe.sample.describe import describe_directions, describe_pairs
 
 _LISTED = 20
 # What a file of keys and values is, by one of its keys.
@@ -157,6 +157,9 @@ def _describe_measurement(measurement, threads, report):
         problems.append("pictures differ: " + "; ".join(sizes) + ".")
     (shape, dtype) = max(kinds, key=lambda kind: len(kinds[kind]), default=((None, None), ""))
     views, lights = measurement.view_directions, measurement.light_directions
+    arranged, gaps = describe_pairs(
+        measurement.view_index, measurement.light_index, len(views), len(lights)
+    )
     return {
         "rows": shape[0],
         "cols": shape[1],
@@ -164,12 +167,12 @@ def _describe_measurement(measurement, threads, report):
         "pairs": measurement.n_pairs,
         "views": describe_directions(views),
         "lights": describe_directions(lights),
-        "product": measurement.n_pairs == len(views) * len(lights),
+        **arranged,
         **_invalid(measurement),
         "clipped_values": clipped,
         "clipped_pictures": clipped_pictures,
         "facts": {key: _cut(value) for key, value in measurement.facts.items()},
-        "problems": [*problems, *measurement.facts.get("warnings", [])],
+        "problems": [*gaps, *problems, *measurement.facts.get("warnings", [])],
     }
 
 
@@ -299,10 +302,17 @@ def _describe_set(path, threads, report):
             if wrong:
                 mislabelled.append(name)
             report(done, len(names))
-        missing = listing.missing()
+        lights, views, light_index, view_index = tables(listing.pairs)
+        arranged, gaps = describe_pairs(
+            view_index,
+            light_index,
+            len(views),
+            len(lights),
+            lambda view, light: _pair(views[view], lights[light]),
+        )
         problems = [
             *_listed("pictures cannot be read", unreadable),
-            *_listed("view/light pairs are missing", [_pair(*pair) for pair in missing]),
+            *gaps,
             *_listed("pairs are there twice", [f"{a!r} and {b!r}" for a, b in listing.duplicates]),
             *_listed("pictures hold values that are not finite", not_finite),
             *_listed("pictures are mislabelled", mislabelled),
@@ -323,10 +333,9 @@ def _describe_set(path, threads, report):
             "stored_as": dtype,
             "format": suffix[1:],
             "pairs": len(names),
-            "views": describe_directions(from_angles(*np.radians(np.array(listing.views).T))),
-            "lights": describe_directions(from_angles(*np.radians(np.array(listing.lights).T))),
-            "product": not missing,
-            "missing_pairs": len(missing),
+            "views": describe_directions(from_angles(*np.radians(np.array(views).T))),
+            "lights": describe_directions(from_angles(*np.radians(np.array(lights).T))),
+            **arranged,
             "duplicate_pairs": len(listing.duplicates),
             "clipped_values": clipped,
             "clipped_pictures": clipped_pictures,

@@ -3,8 +3,8 @@
 The list has a row a picture: ``name``, relative to the list, and one of three sets of columns (`COLUMNS`): angles in degrees;
 vectors to the light and to the eye; or positions of lamp and camera in cm, from the middle of the patch with x to the right, y
 up the picture and z along the normal. Other columns are left alone. CSV is comma-, semicolon- or tab-separated with a header;
-JSON is a list of objects, or an object with that list as ``pairs``. Settings (white, transfer, toroidal, texels_per_mm,
-patch_cm) stand in that object, or in ``btfpipe.json`` beside the list.
+JSON is a list of objects, or an object with that list as ``pairs``. Settings (white or scale, transfer, toroidal,
+texels_per_mm, patch_cm) stand in that object, or in ``btfpipe.json`` beside the list.
 
 From positions the pictures, which must be frontal ones of the patch alone, are brought to one distant light a pair, the one in
 the direction of the lamp from the patch's middle: see `correction`. Views are the camera's direction from there. How
@@ -30,6 +30,7 @@ from btfpipe.formats.picture_sets import (
     SETTINGS,
     beside,
     check_settings,
+    is_settings,
     measurement_of_pictures,
     settings_beside,
 )
@@ -113,7 +114,9 @@ def open_measurement(path, *, listing=None, patch_cm=None):
         lights, views = _directions(listed, label)
         facts = {
             "format": f"pairs ({listed.kind})",
-            "strays": sorted({*archive.names} - {*members, listed.member, beside(listed.member)}),
+            "strays": sorted(
+                {*archive.names} - {*members, listed.member, *beside(archive, listed.member)}
+            ),
         }
         lamps = None
         if listed.kind == "positions":
@@ -239,7 +242,7 @@ def _find(archive, wanted):
 
 
 def _may_be_list(name):
-    likely = name.lower().endswith(_ENDINGS) and PurePosixPath(name).name != SETTINGS
+    likely = name.lower().endswith(_ENDINGS) and not is_settings(name)
     return likely and not is_hidden(name)
 
 

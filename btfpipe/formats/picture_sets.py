@@ -12,7 +12,7 @@ from btfpipe.store import check_fact
 SETTINGS = "btfpipe.json"
 # What settings may be called; `title` and `layout` are for readers of the file alone, the last two for one format each.
 _KNOWN = (
-    "white", "transfer", "toroidal", "texels_per_mm", "title", "layout", "colour", "patch_cm",
+    "white", "scale", "transfer", "toroidal", "texels_per_mm", "title", "layout", "colour", "patch_cm",
 )  # fmt: skip
 _MOST_SETTINGS = 1 << 20  # bytes
 
@@ -61,6 +61,7 @@ def measurement_of_pictures(
         read=read,
         transfer=transfer,
         white=settings.get("white"),
+        scale=settings.get("scale") or 1.0,
         toroidal=settings.get("toroidal"),
         texels_per_mm=settings.get("texels_per_mm"),
         facts=facts,
@@ -80,15 +81,22 @@ def read_settings(archive, name):
     return check_settings(settings, label)
 
 
-def beside(member):
-    """Where the settings of a list of pictures are: in its folder."""
-    return (PurePosixPath(member).parent / SETTINGS).as_posix()
+def is_settings(name):
+    """Whether a file in a folder or zip is a set's settings, in letters of either case, as other systems change them."""
+    return PurePosixPath(name).name.lower() == SETTINGS
+
+
+def beside(archive, member):
+    """Names of the settings of a list of pictures, which are in its folder: one or none."""
+    folder = PurePosixPath(member).parent
+    found = (name for name in archive.names if is_settings(name))
+    return [name for name in found if PurePosixPath(name).parent == folder][:1]
 
 
 def settings_beside(archive, member):
     """Settings beside a list of pictures; none if there is no such file."""
-    name = beside(member)
-    return read_settings(archive, name) if name in archive.names else {}
+    names = beside(archive, member)
+    return read_settings(archive, names[0]) if names else {}
 
 
 def unknown_settings(settings):
@@ -100,12 +108,11 @@ def unknown_settings(settings):
 
 
 def check_settings(settings, label):
-    """Refuse wrong values of white, transfer, toroidal and texels_per_mm; `label` is what messages call their file."""
-    white, transfer = settings.get("white"), settings.get("transfer")
-    density, toroidal = settings.get("texels_per_mm"), settings.get("toroidal")
-    for key, value in (("white", white), ("texels_per_mm", density)):
-        if value is not None:
-            check_fact(value, "positive", f"{label}: {key}")
+    """Refuse wrong values of those that all sets share; `label` is what messages call their file."""
+    transfer, toroidal = settings.get("transfer"), settings.get("toroidal")
+    for key in ("white", "scale", "texels_per_mm"):
+        if settings.get(key) is not None:
+            check_fact(settings[key], "positive", f"{label}: {key}")
     if transfer is not None and transfer not in TRANSFERS:
         raise InputError(
             f"{label}: transfer is {transfer!r}; expected one of {', '.join(TRANSFERS)}."

@@ -77,7 +77,7 @@ def open_measurement(path, *, listing=None):
         names, lights = _parse(archive, lists[0])
         members = _members(archive, lists[0], names, archive.label(lists[0]))
         settings = settings_beside(archive, lists[0])
-        strays = {*archive.names} - {*members, lists[0], beside(lists[0])}
+        strays = {*archive.names} - {*members, lists[0], *beside(archive, lists[0])}
         yield measurement_of_pictures(
             path,
             archive,

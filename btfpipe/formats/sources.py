@@ -3,11 +3,11 @@
 import contextlib
 import importlib
 from collections import namedtuple
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from btfpipe.errors import InputError
 from btfpipe.formats.archive import is_hidden, is_zip, names_in
-from btfpipe.formats.picture_sets import SETTINGS
+from btfpipe.formats.picture_sets import is_settings
 from btfpipe.sample.measurement import Measurement
 
 # A format that can be read. `module` holds recognise(path), which gives a reason in words or None, and `opener`: a context manager that
@@ -20,10 +20,8 @@ FORMATS = {
     "ptm": Format("btfpipe.formats.ptm", "read_model", ("transfer",)),
     "rti": Format("btfpipe.formats.rti", "open_measurement", ("listing",)),
     "pairs": Format("btfpipe.formats.pairs", "open_measurement", ("listing", "patch_cm")),
-    "utia": Format(
-        "btfpipe.formats.utia", "open_measurement", ("pairs", "frontal", "directions", "colour")
-    ),
-    "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs", "frontal")),
+    "utia": Format("btfpipe.formats.utia", "open_measurement", ("pairs", "directions", "colour")),
+    "ubo": Format("btfpipe.formats.ubo", "open_measurement", ("pairs",)),
     "curet": Format("btfpipe.formats.curet", "open_measurement", ("sample_number",)),
     "picture": Format("btfpipe.formats.pictures", "open_measurement", ()),
 }
@@ -50,11 +48,7 @@ def recognise(path):
         return _ENDINGS[ending], f"nothing else fits, and its name ends in {ending}"
     names = [name for name in names_in(path) or [Path(path).name] if not is_hidden(name)]
     for ending, format_ in _LISTS.items():
-        lists = [
-            name
-            for name in names
-            if name.lower().endswith(ending) and PurePosixPath(name).name != SETTINGS
-        ]
+        lists = [name for name in names if name.lower().endswith(ending) and not is_settings(name)]
         if lists:
             return format_, f"nothing else fits, and {lists[0]} is there"
     general = "ubo" if Path(path).is_dir() or is_zip(path) else "picture"

@@ -35,4 +35,12 @@ def write(path, name, appearance, *, threads=1, on_progress=None, **options):
     facts = function(path, appearance, threads=threads, on_progress=on_progress, **options)
     if isinstance(facts, dict):
         return facts
-    return {"method": facts.method, "terms": list(facts.n_terms)}  # the Model that a .btf holds
+    model = facts  # that a .btf holds
+    told = (
+        () if model is appearance else ("rmse", "relative_error", "warnings")
+    )  # of what was left out on the way
+    return {
+        "method": model.method,
+        "terms": list(model.n_terms),
+        **{name: model.about[name] for name in told if name in model.about},
+    }

@@ -2,7 +2,7 @@
 
 Names look like ``00008 tl000 pl000 tv030 pv030.jpg``: light and view, polar angle and azimuth, degrees; folders are
 named after the view. Only the keyed angles count. A set that was simulated carries ``btfpipe.json``, which says what
-Bonn's sets leave open: white, transfer, toroidal, texels_per_mm.
+Bonn's sets leave open: white or scale, transfer, toroidal, texels_per_mm.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.archive import COPY, is_hidden, names_in, open_archive
 from btfpipe.formats.images import Decoder
-from btfpipe.formats.picture_sets import SETTINGS, measurement_of_pictures, read_settings
+from btfpipe.formats.picture_sets import is_settings, measurement_of_pictures, read_settings
 
 _ENDINGS = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _KEYS = re.compile(r"(?<![a-z])(tl|pl|tv|pv)[ _=:]?(-?\d+(?:\.\d+)?)", re.IGNORECASE)
@@ -67,7 +67,7 @@ class Listing:
         for name in archive.names:
             base = COPY.sub("", PurePosixPath(name).name)
             angles = parse_name(base)
-            if base == SETTINGS:
+            if is_settings(base):
                 self.settings = read_settings(archive, name)
             elif angles is None or is_hidden(name) or not base.lower().endswith(_ENDINGS):
                 self.strays.append(name)
@@ -88,25 +88,43 @@ class Listing:
         self.lights = sorted({light for _, light in pairs})
 
     def missing(self):
-        """The (view, light) in degrees that a product of these views and lights lacks."""
-        if len(self.pairs) == len(self.views) * len(self.lights):
-            return []
-        return [(v, n) for v in self.views for n in self.lights if (v, n) not in self.pairs]
+        """Yield the (view, light) in degrees that a product of these views and lights lacks: many, for a list of pairs."""
+        for view in self.views:
+            for light in self.lights:
+                if (view, light) not in self.pairs:
+                    yield view, light
 
-    def choose(self, path, pairs=False, frontal=False):
-        """The pairs to read: all, checked to be a product unless `pairs`, or only the one nearest the normal.
+    def require_whole(self, path, any_pairs=False):
+        """Check that there are pairs, none of them twice, which are a product of views and lights unless `any_pairs`.
 
         Raises
         ------
         InputError
-            If there are none, a pair is there twice, or one is missing.
+            If not.
         """
-        _require_whole(path, self, pairs or frontal)
-        if not frontal:
-            return self.pairs
-        # least sum of squared angles; ties go to the first in order
-        pair = min(self.pairs, key=lambda pair: pair[0][0] ** 2 + pair[1][0] ** 2)
-        return {pair: self.pairs[pair]}
+        if not self.pairs:
+            seen = (
+                f"{len(self.strays)} other files, first {self.strays[0]}" if self.strays else "none"
+            )
+            raise InputError(
+                f"{path}: holds no pictures with light and view angles in their names ({seen}); expected names such"
+                " as '00008 tl000 pl000 tv030 pv030.jpg', or beside the pictures a CSV with the columns name, theta_l, phi_l, theta_v,"
+                " phi_v, or an .lp list; a picture by itself is ingested by naming it."
+            )
+        if self.duplicates:
+            first, second = self.duplicates[0]
+            raise InputError(
+                f"{path}: {len(self.duplicates)} pairs are there twice (first: {first!r} and {second!r});"
+                " remove one of each."
+            )
+        whole = len(self.views) * len(self.lights)
+        if len(self.pairs) < whole and not any_pairs:
+            (tv, pv), (tl, pl) = next(self.missing())
+            raise InputError(
+                f"{path}: {whole - len(self.pairs)} of {whole} view/light pairs are missing"
+                f" (first: tl{tl:g} pl{pl:g} tv{tv:g} pv{pv:g}). Add them, or pass --pairs to keep"
+                f" the {len(self.pairs)} there are as a list of pairs."
+            )
 
 
 def direction(angles, label):
@@ -134,7 +152,7 @@ def recognise(path):
 
 
 @contextlib.contextmanager
-def open_measurement(path, *, pairs=False, frontal=False):
+def open_measurement(path, *, pairs=False):
     """Open a folder or zip in UBO2003's layout.
 
     Parameters
@@ -143,8 +161,6 @@ def open_measurement(path, *, pairs=False, frontal=False):
         Folder or zip; see `Listing` for what is read.
     pairs : bool
         Accept pairs that are not a product of views and lights.
-    frontal : bool
-        Only the pair nearest the normal, of light and view.
 
     Yields
     ------
@@ -157,9 +173,9 @@ def open_measurement(path, *, pairs=False, frontal=False):
     """
     with open_archive(path) as archive, Decoder() as decoder:
         listing = Listing(archive)
-        chosen = listing.choose(path, pairs, frontal)
-        lights, views, light_index, view_index = tables(chosen)
-        members = list(chosen.values())
+        listing.require_whole(path, pairs)
+        lights, views, light_index, view_index = tables(listing.pairs)
+        members = list(listing.pairs.values())
         # Bonn states no response curve; users of its JPEGs invert gamma 2.2
         jpeg = members[0].lower().endswith((".jpg", ".jpeg"))
         yield measurement_of_pictures(
@@ -185,32 +201,3 @@ def tables(pairs):
     light_index = np.array([light_at[light] for _, light in pairs], np.int32)
     view_index = np.array([view_at[view] for view, _ in pairs], np.int32)
     return lights, views, light_index, view_index
-
-
-def _require_whole(path, listing, any_pairs):
-    """Refuse a listing with no pictures, a pair twice, or (unless `any_pairs`) a pair missing."""
-    if not listing.pairs:
-        seen = (
-            f"{len(listing.strays)} other files, first {listing.strays[0]}"
-            if listing.strays
-            else "none"
-        )
-        raise InputError(
-            f"{path}: holds no pictures with light and view angles in their names ({seen}); expected names such"
-            " as '00008 tl000 pl000 tv030 pv030.jpg', or beside the pictures a CSV with the columns name, theta_l, phi_l, theta_v,"
-            " phi_v, or an .lp list; a picture by itself is ingested by naming it."
-        )
-    if listing.duplicates:
-        first, second = listing.duplicates[0]
-        raise InputError(
-            f"{path}: {len(listing.duplicates)} pairs are there twice (first: {first!r} and {second!r});"
-            " remove one of each."
-        )
-    missing = listing.missing()
-    if missing and not any_pairs:
-        (tv, pv), (tl, pl) = missing[0]
-        raise InputError(
-            f"{path}: {len(missing)} of {len(listing.views) * len(listing.lights)} view/light pairs are missing"
-            f" (first: tl{tl:g} pl{pl:g} tv{tv:g} pv{pv:g}). Add them, or pass --pairs to keep"
-            f" the {len(listing.pairs)} there are as a list of pairs."
-        )

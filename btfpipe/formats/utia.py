@@ -91,13 +91,13 @@ def read_shifts(path):
 
 
 @contextlib.contextmanager
-def open_measurement(path, *, pairs=False, frontal=False, directions=None, colour=None):
+def open_measurement(path, *, pairs=False, directions=None, colour=None):
     """Open a folder or zip in UTIA's layout.
 
     Parameters
     ----------
     path : path-like
-    pairs, frontal : bool
+    pairs : bool
         As for `ubo.open_measurement`.
     directions : path-like, optional
         List of directions with the shifted lights; see `read_shifts`. The result is then a list of pairs.
@@ -118,17 +118,17 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
         raise InputError(f"colour {colour!r}; expected xyz or rgb.")
     with open_archive(path) as archive, Decoder() as decoder:
         listing = ubo.Listing(archive)
-        chosen = listing.choose(path, pairs, frontal)
+        listing.require_whole(path, pairs)
         settings = listing.settings
         colour = colour or settings.get("colour") or "xyz"
         if colour not in COLOURS:
             raise InputError(f"{path}: colour is {colour!r} in {SETTINGS}; expected xyz or rgb.")
-        lights, views, light_index, view_index = ubo.tables(chosen)
+        lights, views, light_index, view_index = ubo.tables(listing.pairs)
         facts = {"format": "UTIA", "strays": listing.strays}
-        facts["coincident_pairs"] = sum(view == light for view, light in chosen)
+        facts["coincident_pairs"] = sum(view == light for view, light in listing.pairs)
         if directions is not None:
             shifts = read_shifts(directions)
-            lights, light_index, facts["shifted_lights"] = _shift(chosen, shifts, directions)
+            lights, light_index, facts["shifted_lights"] = _shift(listing.pairs, shifts, directions)
         elif facts["coincident_pairs"] and settings.get("layout") != _LAYOUT:
             facts["warnings"] = [
                 f"{facts['coincident_pairs']} pairs have their light where their view is; their true lights stood"
@@ -145,7 +145,7 @@ def open_measurement(path, *, pairs=False, frontal=False, directions=None, colou
             path,
             archive,
             decoder,
-            list(chosen.values()),
+            list(listing.pairs.values()),
             settings,
             facts,
             rgb=rgb,

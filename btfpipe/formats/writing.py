@@ -113,9 +113,10 @@ class Pictures:
     Attributes
     ----------
     settings : dict
-        For ``btfpipe.json``: white (only where the scale is known), transfer, toroidal, texels_per_mm.
+        For ``btfpipe.json``: white (where the scale is known) or scale (where only values relative to each other are), transfer,
+        toroidal, texels_per_mm.
     facts : dict
-        For a summary: pictures, white, largest (known for eight-bit pictures that needed a look).
+        For a summary: pictures, white, largest (known for eight-bit pictures that needed a look), warnings (sentences).
     """
 
     def __init__(
@@ -149,13 +150,20 @@ class Pictures:
             else:
                 largest = self._largest()
                 self.white = 1 / max(largest, 1.0)
+        absolute = getattr(appearance, "absolute", False)
         self.settings = {
-            "white": self.white if getattr(appearance, "absolute", False) else None,
+            "white": self.white if absolute else None,
+            "scale": None if absolute else 1 / self.white,
             "transfer": self.transfer,
             "toroidal": bool(appearance.toroidal),
             "texels_per_mm": appearance.texels_per_mm,
         }
         self.facts = {"pictures": len(self.pairs), "white": self.white, "largest": largest}
+        if largest is not None and largest > 1:
+            self.facts["warnings"] = [
+                f"values up to {largest:.3g} are divided by that for 8 bits, whose steps dark ones then see; --suffix .exr keeps"
+                " them as they are"
+            ]
 
     def _largest(self):
         def work(block):

@@ -5,7 +5,14 @@ import math
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.metrics.kernels import N_SUMS, WINDOW, encode_table, ssim_pictures, sum_pictures
+from btfpipe.metrics.kernels import (
+    N_SUMS,
+    WINDOW,
+    encode_table,
+    ssim_pictures,
+    sum_pictures,
+    whole_windows,
+)
 from btfpipe.metrics.pictures import psnr
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
@@ -24,24 +31,20 @@ def matching_pairs(model, sample):
         None if a light, a view or a combination of the Sample is missing from the Model (directions are the same
         within 0.05 degrees).
     """
-    index = []
-    for have, want, chosen in (
-        (model.light_directions, sample.light_directions, sample.light_index),
-        (model.view_directions, sample.view_directions, sample.view_index),
-    ):
-        # chords, as the arc cosine cannot tell small angles
-        chord = np.linalg.norm(np.asarray(want)[:, None] - np.asarray(have)[None], axis=2)
-        used = np.unique(chosen)
-        if chord.min(axis=1)[used].max() > _SAME_DIRECTION:
-            return None
-        index.append(chord.argmin(axis=1)[chosen])
-    lights = len(model.light_directions)
-    number = np.asarray(model.view_index, np.int64) * lights + model.light_index
-    order = np.argsort(number, kind="stable")
-    wanted = index[1].astype(np.int64) * lights + index[0]
-    place = np.minimum(np.searchsorted(number[order], wanted), len(number) - 1)
-    found = order[place]
-    return found if (number[found] == wanted).all() else None
+    from scipy.spatial import cKDTree
+
+    have, want = (
+        np.concatenate(
+            [a.light_directions[a.light_index], a.view_directions[a.view_index]],
+            axis=1,
+            dtype=np.float64,
+        )
+        for a in (model, sample)
+    )
+    found = cKDTree(have).query(want)[1]
+    # chords, as the arc cosine cannot tell small angles
+    chords = np.linalg.norm((want - have[found]).reshape(-1, 2, 3), axis=2)
+    return found if chords.max() <= _SAME_DIRECTION else None
 
 
 def white_level(sample):
@@ -71,7 +74,8 @@ class Comparison:
     rmse, relative_error : (pairs,) float64
         Linear; see `btfpipe.metrics.rmse`.
     display_rmse, ssim : (pairs,) float64
-        In the display domain; SSIM of the luma, not a number for pictures under 11 texels.
+        In the display domain; SSIM of the luma, over windows of valid texels: not a number if there is none, as in pictures
+        under 11 texels.
     white : float
         Peak of the linear PSNR, white of the display domain.
     """
@@ -160,7 +164,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     ----------
     model : Appearance
     sample : Sample
-        The reference. Its valid texels count; its white is the peak.
+        The reference; its white is the peak. Texels count that are valid in both.
     interpolation : str, optional
         See `model_pictures`.
     threads : int
@@ -175,7 +179,7 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
     Raises
     ------
     InputError
-        If the sizes differ, or as `model_pictures`.
+        If the sizes differ, if no texel is valid in both, or as `model_pictures`.
     """
     if tuple(model.shape) != tuple(sample.shape):
         raise InputError(
@@ -184,13 +188,17 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
         )
     rows, cols = sample.shape
     texels = rows * cols
-    mask = np.ones((rows, cols), bool) if sample.mask is None else np.asarray(sample.mask, bool)
+    mask = np.ones((rows, cols), bool)
+    for who in (sample, model):
+        if who.mask is not None:
+            mask &= who.mask
     if not mask.any():
-        raise InputError("the sample has no valid texel.")
+        raise InputError("no texel is valid in both the model and the sample.")
     white = white_level(sample)[0]
     over_white = np.float32(min(1 / white, float(np.finfo(np.float32).max)))
     table = encode_table()
     pictures = model_pictures(model, sample, interpolation)
+    windows = whole_windows(mask) if min(rows, cols) >= WINDOW else None
     sums = np.empty((sample.n_pairs, N_SUMS))
     ssim = np.full(sample.n_pairs, np.nan)
 
@@ -200,8 +208,8 @@ def compare(model, sample, *, interpolation=None, threads=1, on_progress=None):
             other = np.ascontiguousarray(pictures(pairs)).reshape(-1, texels, 3)
         lumas = np.empty((2, len(reference), texels), np.float32)
         sum_pictures(reference, other, mask.ravel(), over_white, table, sums[pairs], *lumas)
-        if min(rows, cols) >= WINDOW:
-            ssim_pictures(*lumas.reshape(2, -1, rows, cols), mask, ssim[pairs])
+        if windows is not None:
+            ssim_pictures(*lumas.reshape(2, -1, rows, cols), windows, ssim[pairs])
         return pairs.stop
 
     with single_threaded_blas():

@@ -9,8 +9,8 @@ from btfpipe.sample.transfer import encode
 
 WINDOW = 11
 _SIGMA = 1.5
-_C1 = np.float32(0.01**2)
-_C2 = np.float32(0.03**2)
+_C1 = 0.01**2
+_C2 = 0.03**2
 _NODES = 1 << 16
 N_SUMS = 5  # columns of `sum_pictures`
 
@@ -18,7 +18,7 @@ N_SUMS = 5  # columns of `sum_pictures`
 def _gaussian():
     x = np.arange(WINDOW) - WINDOW // 2
     weights = np.exp(-0.5 * (x / _SIGMA) ** 2)
-    return (weights / weights.sum()).astype(np.float32)
+    return weights / weights.sum()
 
 
 _WEIGHTS = _gaussian()
@@ -92,22 +92,29 @@ def sum_pictures(reference, pictures, mask, over_white, table, sums, luma_refere
         sums[n, 4] = s4
 
 
+def whole_windows(mask):
+    """Windows (rows - 10, cols - 10) that hold valid texels alone, of a mask (rows, cols)."""
+    down = np.lib.stride_tricks.sliding_window_view(mask, WINDOW, axis=0).all(axis=-1)
+    return np.lib.stride_tricks.sliding_window_view(down, WINDOW, axis=1).all(axis=-1)
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def ssim_pictures(reference, pictures, mask, out):
-    """Mean structural similarity of each picture over windows that lie inside and are centred on valid texels.
+def ssim_pictures(reference, pictures, whole, out):
+    """Mean structural similarity of each picture over whole windows.
 
     Parameters
     ----------
     reference, pictures : (n, rows, cols) float32
         In [0, 1], at least 11 x 11.
-    mask : (rows, cols) bool
+    whole : (rows - 10, cols - 10) bool
+        Windows that count; see `whole_windows`.
     out : (n,) float64
-        Filled; not a number where no window is valid.
+        Filled; not a number where no window counts.
     """
     _, rows, cols = reference.shape
-    half = WINDOW // 2
-    column = np.empty((5, cols), np.float32)  # weighted sums down each column
-    window = np.empty((5, cols - WINDOW + 1), np.float32)
+    # in double precision: variances are small differences of these, and SSIM would exceed 1
+    column = np.empty((5, cols))  # weighted sums down each column
+    window = np.empty((5, cols - WINDOW + 1))
     for n in range(reference.shape[0]):
         total = 0.0
         count = 0
@@ -116,8 +123,8 @@ def ssim_pictures(reference, pictures, mask, out):
             for k in range(WINDOW):
                 w = _WEIGHTS[k]
                 for j in range(cols):
-                    x = reference[n, i + k, j]
-                    y = pictures[n, i + k, j]
+                    x = np.float64(reference[n, i + k, j])
+                    y = np.float64(pictures[n, i + k, j])
                     column[0, j] += w * x
                     column[1, j] += w * y
                     column[2, j] += w * x * x
@@ -130,7 +137,7 @@ def ssim_pictures(reference, pictures, mask, out):
                     for j in range(window.shape[1]):
                         window[q, j] += w * column[q, j + k]
             for j in range(window.shape[1]):
-                if mask[i + half, j + half]:
+                if whole[i, j]:
                     mx = window[0, j]
                     my = window[1, j]
                     vx = window[2, j] - mx * mx

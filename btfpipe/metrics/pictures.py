@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.metrics.kernels import WINDOW, encode_table, ssim_pictures
+from btfpipe.metrics.kernels import WINDOW, encode_table, ssim_pictures, whole_windows
 from btfpipe.sample.transfer import encode
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
@@ -83,7 +83,7 @@ def ssim(reference, picture):
         )
     stacks = [np.ascontiguousarray(p[None], np.float32) for p in (reference, picture)]
     out = np.empty(1)
-    ssim_pictures(*stacks, np.ones(reference.shape, bool), out)
+    ssim_pictures(*stacks, whole_windows(np.ones(reference.shape, bool)), out)
     return float(out[0])
 
 

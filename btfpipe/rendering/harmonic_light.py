@@ -76,6 +76,8 @@ class HarmonicEnvironment:
         Of the environment's radiance in world axes, as `project_environment` gives them; at least `terms` of them.
     terms : int, optional
         The environment's terms to use, a square number; 169 by default, or as many as there are if fewer.
+    occlusion_rays : int
+        Rays a point by which a renderer finds `visibility`, if it has some; not used here.
 
     Raises
     ------
@@ -83,7 +85,7 @@ class HarmonicEnvironment:
         A Model of another method, coefficients that are not finite, or not as many as a square number and as `terms`.
     """
 
-    def __init__(self, model, coefficients, terms=None):
+    def __init__(self, model, coefficients, terms=None, occlusion_rays=0):
         if not isinstance(model, HarmonicsModel):
             raise InputError(
                 f"light in the frequency domain needs a Model of method harmonics; this is"
@@ -103,7 +105,7 @@ class HarmonicEnvironment:
             raise InputError(
                 f"{terms} terms of an environment asked for; it has {len(coefficients)}. Project it to more."
             )
-        self.occlusion_rays = 0  # a point, for a renderer to ask
+        self.occlusion_rays = occlusion_rays
         self.shader = HarmonicsShader(model)
         self.environment = np.ascontiguousarray(coefficients[:terms], np.float32)
         self.coupling = _coupling(model.light_terms, terms)

@@ -350,11 +350,15 @@ def gather_lookups(
 
 @njit(cache=True, nogil=True)
 def add_lookups(values, blend, target, irradiance, radiance):
-    """Add ``value * E / pi`` of each lookup to its point's radiance (n, 3) float64."""
+    """Add ``value * E / pi`` of each lookup to its point's radiance (n, 3) float64.
+
+    Values below 0, where compression rings, count as 0; NaN stays.
+    """
     for q in range(len(values)):
         h = target[q]
         for c in range(3):
-            radiance[h, c] += values[q, c] * blend[q] * irradiance[h, c] / np.pi
+            value = np.float32(0.0) if values[q, c] < 0 else values[q, c]
+            radiance[h, c] += value * blend[q] * irradiance[h, c] / np.pi
 
 
 @njit(cache=True, nogil=True)

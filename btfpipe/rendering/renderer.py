@@ -186,7 +186,6 @@ class Renderer:
             if sky.occlusion_rays:
                 visibility[mine] = self._open_share(points, mine, sky.occlusion_rays)
             sky.shade(row, col, frames, at_o, values, visibility[target])
-            np.maximum(values, 0, out=values)  # sharp lights ring
             kernels.add_lookups(values, blend, target, full, radiance)
 
     def _open_share(self, points, mine, rays):

@@ -210,10 +210,11 @@ def _environment(light, read_picture, opened):
 def _stand_for(environment, number, light, seed):
     """The directional lights of an environment."""
     method = light.get("method", "q2tree")
-    count = light.get("lights", 64)
     if method == "harmonics":  # for objects of other Models
-        method, count = "q2tree", max(count, 12)
-    directions, irradiances = environment.lights(count, method, seed)
+        method = "q2tree"
+    elif strange := {"terms", "occlusion_rays"} & set(light):
+        raise InputError(f"{min(strange)} is of method harmonics; the method is {method}.")
+    directions, irradiances = environment.lights(light.get("lights", 64), method, seed)
     return [Light(True, *both, number) for both in zip(directions, irradiances, strict=True)]
 
 
@@ -229,11 +230,10 @@ def _add_sky(things, number, environment, light):
             "method harmonics needs an object with a Model of that method (`btfpipe compress --method harmonics`);"
             " there is none. Take method q2tree."
         )
-    coefficients = project_environment(environment, light.get("terms", 169))
+    terms, rays = light.get("terms", 169), light.get("occlusion_rays", 16)
+    coefficients = project_environment(environment, terms)
     for dressing in dressings:
-        sky = HarmonicEnvironment(dressing.model, coefficients)
-        sky.occlusion_rays = light.get("occlusion_rays", 16)
-        dressing.skies[number] = sky
+        dressing.skies[number] = HarmonicEnvironment(dressing.model, coefficients, terms, rays)
 
 
 def _material(once, entry):

@@ -73,10 +73,12 @@ def describe_sample(sample, report=lambda done, total: None):
     dict
         With ``problems``, a list of sentences.
     """
-    pairs = list(zip(sample.view_index.tolist(), sample.light_index.tolist(), strict=True))
-    seen = set(pairs)
-    n_views, n_lights = len(sample.view_directions), len(sample.light_directions)
-    missing = [(v, n) for v in range(n_views) for n in range(n_lights) if (v, n) not in seen]
+    arranged, problems = describe_pairs(
+        sample.view_index,
+        sample.light_index,
+        len(sample.view_directions),
+        len(sample.light_directions),
+    )
     clipped = _clipped(sample, report)
     description = {
         "rows": sample.shape[0],
@@ -84,9 +86,7 @@ def describe_sample(sample, report=lambda done, total: None):
         "pairs": sample.n_pairs,
         "views": describe_directions(sample.view_directions),
         "lights": describe_directions(sample.light_directions),
-        "product": sample.is_product,
-        "missing_pairs": len(missing),
-        "duplicate_pairs": len(pairs) - len(seen),
+        **arranged,
         "clipped_values": clipped,
         "clipped_share": clipped / sample.codes.size,
         "stored_as": str(sample.codes.dtype),
@@ -97,20 +97,12 @@ def describe_sample(sample, report=lambda done, total: None):
         "texels_per_mm": sample.texels_per_mm,
         "flattened": sample.gain is not None,
         "nbytes": sample.nbytes,
-        "problems": [],
+        "problems": problems,
     }
-    if missing and not sample.is_product:
-        names = ", ".join(f"view {v} light {n}" for v, n in missing[:_LISTED])
-        description["problems"].append(
-            f"{len(missing)} of {n_views * n_lights} view/light pairs are missing ({names}"
-            f"{', ...' if len(missing) > _LISTED else ''})."
-        )
     for name in ("scale", "texels_per_mm"):
         value = getattr(sample, name)
         if value is not None and not (math.isfinite(value) and value > 0):
             description["problems"].append(f"{name} is {value}; expected a positive number.")
-    if len(pairs) > len(seen):
-        description["problems"].append(f"{len(pairs) - len(seen)} pairs are there twice.")
     for name, table in (("view", sample.view_directions), ("light", sample.light_directions)):
         length = np.linalg.norm(table, axis=1)
         if abs(length - 1).max() > 1e-4 or table[:, 2].min() < -1e-6:
@@ -118,6 +110,47 @@ def describe_sample(sample, report=lambda done, total: None):
                 f"{name} directions are not all unit vectors above the surface."
             )
     return description
+
+
+def describe_pairs(view_index, light_index, n_views, n_lights, name="view {} light {}".format):
+    """Say how pairs are arranged, and what is wrong with that.
+
+    Parameters
+    ----------
+    view_index, light_index : (pairs,) int
+    n_views, n_lights : int
+        How many there are of each.
+    name : callable
+        ``name(view, light)`` gives what a pair is called.
+
+    Returns
+    -------
+    dict, list of str
+        Facts (``product``, ``arrangement``, ``missing_pairs``: None for a list of pairs, ``duplicate_pairs``), and
+        problems, as sentences.
+    """
+    number = np.asarray(view_index, np.int64) * n_lights + light_index
+    seen, whole = np.unique(number), n_views * n_lights
+    missing, twice = whole - len(seen), len(number) - len(seen)
+    product = len(number) == whole and bool((number == np.arange(whole)).all())
+    # Files get lost out of a product one by one. Where more than a tenth is not there, nobody meant to have it: a list
+    # of positions has about as many views and lights as pairs, and so nearly all of their combinations "missing".
+    is_list = not product and (missing == 0 or missing > max(1, whole // 10))
+    facts = {
+        "product": product,
+        "arrangement": "list of pairs" if is_list else "views times lights",
+        "missing_pairs": None if is_list else missing,
+        "duplicate_pairs": twice,
+    }
+    problems = []
+    if missing and not is_list:
+        gaps = np.setdiff1d(np.arange(whole), seen)[:_LISTED].tolist()
+        names = ", ".join(name(*divmod(gap, n_lights)) for gap in gaps)
+        more = ", ..." if missing > _LISTED else ""
+        problems.append(f"{missing} of {whole} view/light pairs are missing ({names}{more}).")
+    if twice:
+        problems.append(f"{twice} pairs are there twice.")
+    return facts, problems
 
 
 def describe_directions(directions):

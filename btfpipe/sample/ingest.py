@@ -144,7 +144,7 @@ def ingest(
         measurement.light_index,
         measurement.view_index,
         transfer=curve if eight_bit else "linear",
-        scale=1.0 if white is None else 1.0 / white,
+        scale=measurement.scale if white is None else 1.0 / white,
         toroidal=toroidal,
         mask=mask,
         texels_per_mm=_density(measurement, texels_per_mm, (rows, cols), texels),

@@ -30,6 +30,8 @@ class Measurement:
         where the source's lamp stood near, or with the light's cosine inside, where it was divided out. The Sample then holds floating-point values.
     white : float or None
         Decoded value that stands for a perfect white diffuser lit at normal incidence.
+    scale : float
+        Factor on decoded values where that is not known: values as they were before they were scaled to fit.
     toroidal : bool or None
         None if the source does not say.
     texels_per_mm : float or None
@@ -49,6 +51,7 @@ class Measurement:
     transfer: Callable
     correct: Callable | None = None
     white: float | None = None
+    scale: float = 1.0
     toroidal: bool | None = None
     texels_per_mm: float | None = None
     mask: np.ndarray | None = None

@@ -96,14 +96,11 @@ def _kind(path):
 
 
 def _appearance_image(path, material, seed, threads, memory):
-    from btfpipe.analysis.textons import eigen_textures, picture_weights
+    from btfpipe.analysis.textons import feature_image
     from btfpipe.compression import open_appearance
-    from btfpipe.parallel import single_threaded_blas
 
     appearance = open_appearance(path, material)
-    textures, angular = eigen_textures(appearance, seed=seed, threads=threads, memory=memory)
-    with single_threaded_blas():
-        image = textures @ picture_weights(angular)[:, :_DIMENSIONS]
+    image = feature_image(appearance, _DIMENSIONS, seed=seed, threads=threads, memory=memory)
     return image, appearance.toroidal, appearance.mask
 
 

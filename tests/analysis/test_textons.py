@@ -10,11 +10,13 @@ from btfpipe.analysis.textons import (
     cluster,
     eigen_textures,
     equalise,
+    feature_image,
     picture_weights,
     representative_pictures,
     texton_features,
     texton_level,
 )
+from btfpipe.compression import compress
 from btfpipe.compression.svd import SvdModel, compress_svd
 from btfpipe.errors import InputError
 
@@ -52,6 +54,31 @@ def test_responses_of_eigen_textures_are_those_of_the_models_own_pictures(model)
     short = appearance_vectors(model.texture_factors, True).reshape(320, 48, -1)
     combined = np.einsum("pfn,acn->pfac", short, model.angular_factors)
     assert np.abs(combined - explicit).max() < 2e-6 * np.abs(explicit).max()
+
+
+METHODS = {
+    "coded": {"ratio": 4},
+    "svd": {"components": 6},
+    "factored": {"channel_components": (6, 3, 3)},
+    "view-pca": {"components": 3},
+    "local-pca": {"components": 3, "clusters": 4},
+    "harmonics": {"view_harmonics": 4, "light_harmonics": 9},
+}
+
+
+@pytest.mark.parametrize("method", [None, *METHODS])
+def test_distances_of_features_are_those_of_all_values(sample, method):
+    appearance = compress([sample], method, **METHODS[method]) if method else sample
+    values = appearance.pictures(slice(None)).transpose(1, 2, 0, 3).reshape(320, -1)
+    features, few = (feature_image(appearance, n) for n in (None, 3))
+    assert features.shape[:2] == few.shape[:2] == (16, 20)
+    expected = distances(values)
+    # but for what 40 terms and half precision leave out
+    np.testing.assert_allclose(
+        distances(features.reshape(320, -1)), expected, atol=3e-3 * expected.max()
+    )
+    assert few.shape[2] == 3
+    assert (distances(few.reshape(320, -1)) <= expected + 3e-3 * expected.max()).all()
 
 
 def test_responses_are_those_of_the_original_pictures_within_the_compression_error(sample):

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from btfpipe.compression import open_appearance
 from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import bonn81
 from btfpipe.metrics.comparison import matching_pairs
@@ -21,15 +22,23 @@ def small(make_sample, tmp_path):
     ("format_", "suffix", "taken_for", "atol"),
     [
         ("ubo", ".png", "ubo", 0.02),
+        ("utia", ".png", "utia", 0.02),
+        ("pairs", ".png", "pairs", 0.02),
         ("ubo", ".exr", "ubo", 1e-3),
         ("utia", ".exr", "utia", 3e-3),
         ("pairs", ".exr", "pairs", 1e-3),
         ("rti", ".png", "rti", 0.02),
     ],
 )
+@pytest.mark.parametrize("brightness", [1, 40])
+@pytest.mark.parametrize("absolute", [False, True])
 def test_what_is_exported_is_ingested_as_it_was(
-    btfpipe, small, tmp_path, format_, suffix, taken_for, atol
+    btfpipe, small, tmp_path, format_, suffix, taken_for, atol, brightness, absolute
 ):
+    bright = Sample.open(small)
+    bright.codes = bright.codes * np.float32(brightness)
+    bright.absolute = absolute
+    bright.save(small)
     target = tmp_path / "set.zip"
     btfpipe("export", small, "--format", format_, "--suffix", suffix, "-o", target)
     done = btfpipe("ingest", target, "-o", tmp_path / "back.npz", "--json")
@@ -39,10 +48,10 @@ def test_what_is_exported_is_ingested_as_it_was(
     found = matching_pairs(sample, back)
     assert len(back.light_directions) == 7
     assert back.n_pairs == (7 if format_ == "rti" else 21)
-    ours = sample.pictures(found)
-    theirs = back.pictures(slice(None))
-    scale = 1.0 if back.absolute or suffix == ".exr" else (ours * theirs).sum() / (theirs**2).sum()
-    np.testing.assert_allclose(theirs * scale, ours, atol=atol)
+    assert back.absolute == absolute
+    np.testing.assert_allclose(
+        back.pictures(slice(None)), sample.pictures(found), atol=atol * brightness
+    )
 
 
 def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
@@ -57,6 +66,35 @@ def test_a_model_is_exported_like_a_sample(btfpipe, make_sample, tmp_path):
         rtol=1e-3,
         atol=1e-3,
     )
+
+
+@pytest.mark.parametrize("format_", ["ubo", "utia", "pairs", "rti"])
+def test_settings_in_upper_case_count(btfpipe, small, tmp_path, format_):
+    bright = Sample.open(small)
+    bright.codes = bright.codes * np.float32(8)
+    bright.save(small)
+    btfpipe("export", small, "--format", format_, "--suffix", ".png", "-o", tmp_path / "set")
+    (settings,) = (tmp_path / "set").glob("**/btfpipe.json")
+    settings.rename(settings.with_name("BTFPIPE.JSON"))
+    facts = json.loads(
+        btfpipe("ingest", tmp_path / "set", "-o", tmp_path / "b.npz", "--json").stdout
+    )
+    assert facts.get("strays") in ([], None)
+    assert Sample.open(tmp_path / "b.npz").pictures(slice(None)).max() > 4
+
+
+def test_a_file_of_factors_says_what_it_left_out(btfpipe, small, tmp_path):
+    factors = ("--format", "btf", "--channel-components", 3, 2, 2, "--json")
+    done = btfpipe("export", small, *factors, "-o", tmp_path / "s.btf")
+    btfpipe("ingest", tmp_path / "s.btf", "-o", tmp_path / "back.npz")
+    values = Sample.open(small).pictures(slice(None))
+    error = open_appearance(tmp_path / "back.npz").pictures(slice(None)) - values
+    relative = np.sqrt(np.sum(error**2) / np.sum(values**2))
+    assert json.loads(done.stdout)["relative_error"] == pytest.approx(relative, rel=1e-3)
+    again = btfpipe(
+        "export", tmp_path / "back.npz", "--format", "btf", "--json", "-o", tmp_path / "t.btf"
+    )
+    assert "relative_error" not in json.loads(again.stdout)
 
 
 def test_a_folder_of_others_is_left_alone_when_a_set_is_written(btfpipe, small, tmp_path):

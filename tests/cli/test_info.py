@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from btfpipe import store
+from btfpipe.directions import from_angles
 from btfpipe.formats.images import encode_picture, write_picture
 from btfpipe.sample import Sample
+from btfpipe.sample.describe import describe_sample
 
 
 @pytest.fixture
@@ -78,6 +80,56 @@ def test_missing_and_double_pairs_are_named(info, make_sample, tmp_path):
     assert (said["sample"]["missing_pairs"], said["sample"]["duplicate_pairs"]) == (1, 1)
     assert any("view 0 light 1" in problem for problem in said["problems"])
     assert any("twice" in problem for problem in said["problems"])
+
+
+def scattered(count, side=2):
+    """A list of as many lights and views as pairs."""
+    rng = np.random.default_rng(4)
+    lights, views = (
+        from_angles(rng.uniform(0, 1.4, count), rng.uniform(0, 6, count)) for _ in range(2)
+    )
+    codes = rng.integers(0, 255, (count, side, side, 3), np.uint8)
+    return Sample(codes, lights, views, np.arange(count), np.arange(count))
+
+
+@pytest.mark.parametrize("format_", [None, "pairs", "ubo", "utia"])
+def test_a_list_of_pairs_is_a_fact_and_no_problem(btfpipe, info, tmp_path, format_):
+    path = tmp_path / "s.npz"
+    scattered(12).save(path)
+    if format_:
+        btfpipe("export", path, "--format", format_, "-o", tmp_path / "set.zip")
+        path = tmp_path / "set.zip"
+    said = info(path)
+    assert said["problems"] == []
+    said = said.get("sample", said)
+    assert (said["arrangement"], said["product"]) == ("list of pairs", False)
+    assert said["missing_pairs"] is None
+
+
+@pytest.mark.parametrize(
+    ("lost", "arrangement"), [(13, "views times lights"), (14, "list of pairs")]
+)
+def test_a_product_that_lacks_more_than_a_tenth_is_a_list(
+    info, make_sample, tmp_path, lost, arrangement
+):
+    full = make_sample(2, 2)
+    assert full.n_pairs == 133
+    Sample(
+        full.codes[lost:],
+        full.light_directions,
+        full.view_directions,
+        full.light_index[lost:],
+        full.view_index[lost:],
+    ).save(tmp_path / "s.npz")
+    said = info(tmp_path / "s.npz")
+    assert said["sample"]["arrangement"] == arrangement
+    assert len(said["problems"]) == (arrangement != "list of pairs")
+
+
+def test_a_list_of_positions_is_described_in_little_memory(peak_bytes):
+    with peak_bytes() as peak:
+        assert describe_sample(scattered(1500))["pairs"] == 1500
+    assert peak[0] < 4 << 20
 
 
 @pytest.mark.parametrize("kind", ["model", "features", "surface", "map"])
@@ -211,7 +263,9 @@ def test_without_json_a_person_reads_it_on_stdout(btfpipe, make_sample, make_mea
     assert "rings deg: 0 1, 15 6\n" in result.stdout
     assert result.stdout.endswith("problems: none\n")
     path, _ = make_measurement(change=lambda m: m.pop(next(iter(m))))
-    assert "  - 1 view/light pairs are missing: tl0 pl0 tv0 pv0" in btfpipe("info", path).stdout
+    assert (
+        "  - 1 of 6 view/light pairs are missing (tl0 pl0 tv0 pv0)" in btfpipe("info", path).stdout
+    )
 
 
 def test_a_newer_file_is_refused(btfpipe, tmp_path, monkeypatch):

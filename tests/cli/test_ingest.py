@@ -137,7 +137,7 @@ def test_a_file_of_our_own_is_not_ingested_again(btfpipe, make_sample, tmp_path)
 
 
 def test_frontal_and_size_through_the_command(btfpipe, make_measurement, tmp_path):
-    path, _ = make_measurement()
+    path, _ = make_measurement(change=lambda m: m.popitem())  # one pair of what is no product
     btfpipe("ingest", path, "-o", tmp_path / "s.npz", "--frontal", "--size", "3x4")
     sample = Sample.open(tmp_path / "s.npz")
     assert (sample.n_pairs, sample.shape) == (1, (3, 4))

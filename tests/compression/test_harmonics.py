@@ -290,23 +290,6 @@ def test_shading_agrees_with_texels_and_blends_between_them(rng):
     np.testing.assert_allclose(between, sum(corners), atol=1e-5)
 
 
-def test_distances_of_features_are_those_of_the_values(rng):
-    model = compress_harmonics(smooth_sample(rng, 2, 6, n=5), 9, 16)
-    values = whole(model).transpose(1, 2, 0, 3).reshape(12, -1)
-    features = model.feature_image().reshape(12, -1)
-    fifteen, two = (model.feature_image(n).reshape(12, -1) for n in (15, 2))
-
-    def distances(vectors):
-        return np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
-
-    expected = distances(values)
-    np.testing.assert_allclose(distances(features), expected, atol=1e-4 * expected.max())
-    # five lobes of three channels are fifteen directions, but for the codes' rounding
-    np.testing.assert_allclose(distances(fifteen), expected, atol=0.02 * expected.max())
-    assert two.shape == (12, 2)
-    assert (distances(two) <= distances(fifteen) + 1e-4).all()
-
-
 def test_light_from_below_gives_nothing(rng):
     model = compress_harmonics(smooth_sample(rng, 1, 1), 4, 9)
     below = from_angles([np.pi / 2, 1.6, 3.0], 0.3)

@@ -1,5 +1,6 @@
 import json
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -98,15 +99,6 @@ def test_a_missing_pair_is_named_and_a_list_of_pairs_accepted(make_measurement):
         np.testing.assert_array_equal(measurement.read(4), codes[1, 2])
 
 
-def test_frontal_keeps_the_pair_nearest_the_normal(make_measurement):
-    path, codes = make_measurement(lights=((60, 0), (20, 10)), views=((50, 0), (10, 90)))
-    with ubo.open_measurement(path, frontal=True) as measurement:
-        assert measurement.n_pairs == 1
-        np.testing.assert_allclose(measurement.view_directions[0, 2], np.cos(np.radians(10)))
-        np.testing.assert_allclose(measurement.light_directions[0, 2], np.cos(np.radians(20)))
-        np.testing.assert_array_equal(measurement.read(0), codes[1, 1])
-
-
 def test_strays_are_listed_and_otherwise_ignored(make_measurement):
     strays = ["readme.txt", "__MACOSX/._00 tl000 pl000 tv000 pv000.png", "Thumbs.db", "a/cover.png"]
 
@@ -136,9 +128,10 @@ def test_a_source_without_pictures_says_what_names_it_expects(tmp_path):
             pass
 
 
-def test_settings_of_a_simulated_set_are_honoured(make_measurement):
+@pytest.mark.parametrize("name", ["btfpipe.json", "BTFPIPE.JSON"])
+def test_settings_of_a_simulated_set_are_honoured(make_measurement, name):
     settings = {"white": 0.5, "transfer": "linear", "toroidal": True, "texels_per_mm": 4.0}
-    path, _ = make_measurement(change=lambda m: m.update({"btfpipe.json": json.dumps(settings)}))
+    path, _ = make_measurement(change=lambda m: m.update({name: json.dumps(settings)}))
     with ubo.open_measurement(path) as measurement:
         assert (measurement.white, measurement.toroidal, measurement.texels_per_mm) == (
             0.5,
@@ -181,7 +174,20 @@ def test_the_transfer_curve_follows_the_kind_of_file(make_measurement, suffix, d
 def test_the_listing_counts_what_is_missing(make_measurement):
     path, _ = make_measurement(change=lambda m: m.pop(next(iter(m))))
     with open_archive(path) as archive:
-        assert ubo.Listing(archive).missing() == [((0, 0), (0, 0))]
+        assert list(ubo.Listing(archive).missing()) == [((0, 0), (0, 0))]
+
+
+def test_a_list_with_as_many_directions_as_pairs_is_read_in_little_memory(peak_bytes):
+    angles = [(30 + k / 100, k / 10) for k in range(1500)]
+    names = [ubo.pair_name(k, angle, angle, ".png") for k, angle in enumerate(angles)]
+    archive = SimpleNamespace(names=names, label=str, others=[], folders=[])
+    listing = ubo.Listing(archive)
+    assert len(listing.pairs) == len(listing.views) == len(listing.lights) == 1500
+    with peak_bytes() as peak:
+        listing.require_whole("set.zip", any_pairs=True)
+        with pytest.raises(InputError, match=r"2248500 of 2250000 .*first: tl30.01 .* tv30 pv0\)"):
+            listing.require_whole("set.zip")
+    assert peak[0] < 4 << 20
 
 
 def test_copies_made_by_a_browser_are_not_lost(make_measurement):

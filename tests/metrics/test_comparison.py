@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from btfpipe.compression.svd import compress_svd
-from btfpipe.directions import bonn81
+from btfpipe.directions import bonn81, from_angles
 from btfpipe.errors import InputError
 from btfpipe.metrics import psnr, relative_error, rmse, ssim, to_display
 from btfpipe.metrics.comparison import compare, matching_pairs, white_level
@@ -111,6 +111,47 @@ def test_invalid_texels_do_not_count(make_sample):
     assert compare(other, sample).overall()["linear"]["rmse"] == pytest.approx(0.02, rel=1e-3)
 
 
+def masked(sample, mask):
+    """The same Sample with another mask."""
+    other = subset(sample, slice(0, sample.n_pairs))
+    other.mask = mask
+    return other
+
+
+def test_ssim_reads_no_invalid_texel(make_sample):
+    mask = np.ones((16, 20), bool)
+    mask[:, 15:] = mask[0] = False
+    sample = masked(make_sample(), mask)
+    model = masked(sample, None)
+    # as ingest leaves them: black on one side
+    model.codes = np.where(mask[..., None], sample.codes + np.float32(0.02), 0)
+    inside = slice(1, 16), slice(0, 15)
+    found = compare(model, sample)
+    white = white_level(sample)[0]
+    for pair in (0, 57):
+        lumas = [to_display(everything(a)[pair], white)[inside] @ LUMA for a in (sample, model)]
+        assert found.ssim[pair] == pytest.approx(ssim(*lumas), abs=1e-6)
+    mask[:, 10] = False  # no window is left
+    assert compare(model, sample).overall()["display"]["ssim"] is None
+
+
+def test_texels_count_that_are_valid_in_both(make_sample):
+    sample = make_sample()
+    left, top = np.ones((2, 16, 20), bool)
+    left[:, 17:] = top[12:] = False
+    reference, other = masked(sample, left), masked(sample, top)
+    other.codes = sample.codes + np.where(left & top, 0.01, 9).astype(np.float32)[..., None]
+    both = compare(other, reference).overall()
+    assert both["linear"]["rmse"] == pytest.approx(0.01, rel=1e-4)
+    assert both["display"]["ssim"] > 0.9
+    # nor does the first one's mask alone go unheard
+    reference.mask, other.mask = None, left & top
+    assert compare(other, reference).overall() == both
+    reference.mask = ~other.mask
+    with pytest.raises(InputError, match="no texel is valid in both"):
+        compare(other, reference)
+
+
 def test_pairs_are_found_by_direction_not_by_number(make_sample, rng):
     sample = make_sample()
     chosen = rng.permutation(sample.n_pairs)[:30]
@@ -120,6 +161,19 @@ def test_pairs_are_found_by_direction_not_by_number(make_sample, rng):
     shuffled.light_index = np.argsort(turned)[sample.light_index[chosen]]
     np.testing.assert_array_equal(matching_pairs(sample, shuffled), chosen)
     assert compare(sample, shuffled).overall()["linear"]["rmse"] == 0
+
+
+def test_pairs_of_a_long_list_are_found_in_little_memory(rng, peak_bytes):
+    count = 1500
+    w_i, w_o = (from_angles(rng.uniform(0, 1.4, count), rng.uniform(0, 6, count)) for _ in range(2))
+    w_o[7] = w_o[3]  # a view that two pairs share and that is there twice
+    index = np.arange(count)
+    sample = Sample(np.zeros((count, 1, 1, 3), np.uint8), w_i, w_o, index, index)
+    turned = subset(sample, index[::-1])
+    matching_pairs(sample, sample)  # imports
+    with peak_bytes() as peak:
+        np.testing.assert_array_equal(matching_pairs(sample, turned), index[::-1])
+    assert peak[0] < 4 << 20
 
 
 def test_a_missing_direction_or_pair_is_noticed(make_sample):

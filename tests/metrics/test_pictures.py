@@ -67,7 +67,13 @@ def test_ssim_of_a_picture_with_itself_is_one(rng):
 def test_ssim_of_two_greys_has_only_the_luminance_term():
     a, b = np.full((12, 12), 0.2), np.full((12, 12), 0.6)
     expected = (2 * 0.2 * 0.6 + 1e-4) / (0.2**2 + 0.6**2 + 1e-4)
-    assert ssim(a, b) == pytest.approx(expected, abs=2e-4)
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_never_exceeds_one(rng):
+    levels = rng.random((40, 2))
+    pictures = [[np.full((11, 11), level) for level in pair] for pair in levels]
+    assert max(ssim(a, a + 1e-4 * b) for a, b in pictures) <= 1
 
 
 def test_ssim_of_a_negative_is_negative(rng):

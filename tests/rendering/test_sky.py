@@ -70,6 +70,46 @@ def test_the_frequency_domain_agrees_with_many_lights(white):
     np.testing.assert_allclose(spectral, sampled, rtol=0.02)
 
 
+def test_the_terms_asked_for_are_those_that_light(white):
+    """A narrow lamp needs many, and each more brings some light."""
+    lamp = [[0.48], [0.36], [0.8]]
+    write_map(white.parent / "map.exr", lambda d: (d @ lamp > 0.995) * np.ones(3), 96)
+    truth = picture(white.parent, "q2tree")[4, 4, 0]
+    seen = [
+        picture(white.parent, "harmonics", f", occlusion_rays: 0, terms: {n}")[4, 4, 0]
+        for n in (4, 169, 400, 784)
+    ]
+    assert len(set(seen)) == 4
+    np.testing.assert_allclose(seen[1:], truth, rtol=2e-3)
+    assert abs(seen[0] / truth - 1) > 0.1
+
+
+@pytest.mark.parametrize("option", ["terms: 25", "occlusion_rays: 3"])
+@pytest.mark.parametrize("method", ["q2tree", "alias"])
+def test_options_of_the_frequency_domain_are_not_taken_elsewhere(white, option, method):
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    with pytest.raises(
+        InputError,
+        match=rf"lights\[0\]: {option[:5]}.* is of method harmonics; the method is {method}",
+    ):
+        picture(white.parent, method, f", {option}")
+
+
+@pytest.mark.parametrize("method", ["harmonics", "q2tree"])
+def test_values_below_zero_darken_nothing(white, method):
+    """A patch of which a half reflects less than nothing, as compression has it, beside a white one."""
+    directions = bonn81()
+    pair = np.arange(81 * 81)
+    sign = np.where(np.arange(2) == 0, -1.0, 1.0)[None, None, :, None]
+    codes = directions[pair % 81, 2][:, None, None, None] * np.ones((1, 2, 2, 3)) * sign
+    sample = Sample(codes.astype(np.float32), directions, directions, pair % 81, pair // 81)
+    (compress_harmonics(sample) if method == "harmonics" else sample).save(white)
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    seen = picture(white.parent, method)
+    assert seen.min() == 0
+    np.testing.assert_allclose(seen.max(), 1, atol=0.02)
+
+
 def test_the_back_of_a_surface_is_lit_as_by_many_lights(white):
     """Behind, the frame is mirrored; the diffuser is tilted along s, so that the mirror would show."""
     directions = bonn81()

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shared_meshes import torus
 
 _MAKER = Path(__file__).parents[2] / "data-sample" / "make_meshes.py"
 
@@ -30,27 +31,6 @@ def grid(rows=9, cols=13, width=1.5, height=1.0):
     i = np.arange(rows * cols).reshape(rows, cols)
     a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
     return vertices, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]).astype(
-        np.int32
-    )
-
-
-def torus(around=24, across=12, outer=1.0, inner=0.4):
-    """A torus about the y axis."""
-    u, w = np.meshgrid(
-        2 * np.pi * np.arange(around) / around,
-        2 * np.pi * np.arange(across) / across,
-        indexing="ij",
-    )
-    reach = outer + inner * np.cos(w)
-    vertices = np.stack([reach * np.cos(u), inner * np.sin(w), -reach * np.sin(u)], 2).reshape(
-        -1, 3
-    )
-    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
-    k, m = (i + 1) % around, (j + 1) % across
-    a, b, c, d = (
-        x.ravel() for x in (i * across + j, k * across + j, k * across + m, i * across + m)
-    )
-    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(
         np.int32
     )
 
@@ -95,6 +75,6 @@ def obj(path, vertices, faces):
 
 @pytest.fixture(scope="session")
 def shapes():
-    """The makers of this file by name."""
-    names = ("make_meshes", "sphere", "grid", "torus", "boxes", "double_ring", "cube", "obj")
-    return SimpleNamespace(**{name: globals()[name] for name in names})
+    """The makers of this file, and the torus, by name."""
+    makers = (make_meshes, sphere, grid, torus, boxes, double_ring, cube, obj)
+    return SimpleNamespace(**{maker.__name__: maker for maker in makers})

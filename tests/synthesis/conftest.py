@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shared_meshes import even_sphere
 
 from btfpipe.surface import Level, Surface
 
@@ -18,25 +19,6 @@ def _grid(rows, cols, step=1.0):
     normals = np.tile(np.float32([0, 0, 1]), (len(vertices), 1))
     tangents = np.tile(np.float32([1, 0, 0]), (len(vertices), 1))
     return Level(vertices, faces, normals, tangents)
-
-
-def _sphere(n):
-    """A unit sphere of n even points, s to the east and t to the north."""
-    from scipy.spatial import ConvexHull
-
-    i = np.arange(n) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
-    v = np.stack(
-        [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1
-    )
-    faces = ConvexHull(v).simplices
-    corners = v[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("nd,nd->n", normal, corners.mean(axis=1)) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    east = np.cross([0, 0, 1], v)
-    east /= np.linalg.norm(east, axis=1, keepdims=True)
-    return Level(v, faces.astype(np.int32), v.astype(np.float32), east.astype(np.float32))
 
 
 def _link(fine, coarse):
@@ -66,13 +48,13 @@ def grid():
 @pytest.fixture
 def sphere():
     """Make a sphere level of n vertices."""
-    return _sphere
+    return even_sphere
 
 
 @pytest.fixture(scope="session")
 def sphere_surface():
     """A sphere of two levels, 3000 and 750 vertices."""
-    fine, coarse = _sphere(3000), _sphere(750)
+    fine, coarse = even_sphere(3000), even_sphere(750)
     _link(fine, coarse)
     return Surface([fine, coarse], digest="sphere")
 
