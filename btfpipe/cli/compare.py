@@ -211,7 +211,7 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
             click.echo(
                 f"{words.get(name, name)}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
                 f" {'undefined' if relative is None else f'{100 * relative:.2f} %'}; display PSNR"
-                f" {_db(display['psnr_db'])}, SSIM {'none (under 11 texels)' if ssim is None else round(ssim, 4)}",
+                f" {_db(display['psnr_db'])}, SSIM {'none (no 11 x 11 valid texels)' if ssim is None else round(ssim, 4)}",
                 err=True,
             )
     return {"inputs": [model, sample], **taken, **facts, "comparisons": overall}

@@ -147,7 +147,7 @@ def test_what_has_no_error_or_no_likeness_is_called_so(btfpipe, files, make_samp
     sample.save(files / "black.npz")
     said = btfpipe("compare", files / "small.npz", files / "black.npz").stderr
     assert "relative error undefined; display" in said
-    assert "SSIM none (under 11 texels)\n" in said
+    assert "SSIM none (no 11 x 11 valid texels)\n" in said
 
 
 def test_of_lists_the_nearest_pairs_are_what_is_reported(btfpipe, files, make_sample):
