@@ -4,23 +4,15 @@ Members are stored, not compressed, and their array data starts at a multiple of
 a reader maps them into memory instead of copying them. One member, ``about.json``, says what the
 file is: kind, format version, parameters, digests of the inputs, program version. Nothing in the file
 depends on the clock, the machine's paths or the number of threads, so equal work gives equal bytes.
-
-A file is written as ``NAME.btfpipe-XXXXXXXX.part`` beside its target and moved into place when complete. What a killed run
-left of that name, and nothing else, goes when the target is written again.
 """
 
 import contextlib
-import errno
-import fcntl
 import hashlib
 import io
 import json
 import math
 import mmap
 import os
-import re
-import secrets
-import shutil
 import stat
 import struct
 import tempfile
@@ -31,7 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from btfpipe import __version__
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, amount
+from btfpipe.files import whole
 
 ALIGNMENT = 64
 FORMAT_VERSION = 1
@@ -67,153 +60,6 @@ _FORMS = {
         ),
     ),
 }
-
-
-@contextlib.contextmanager
-def whole(path, mode="wb"):
-    """Open `path` for writing; it appears only if the block succeeds.
-
-    Parameters
-    ----------
-    path : path-like
-        Target; an existing file is replaced at the end, not before.
-    mode : str
-        As for `open`; text modes are UTF-8.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, cannot be written, or runs full.
-    """
-    path = Path(path)
-    part = _new_part(path)
-    try:
-        try:
-            _remove_stale(path)
-            file = part.open(mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8")
-        except OSError as error:
-            raise InputError(_cannot_write(path, error)) from error
-        try:
-            with file:
-                _lock(file.fileno())
-                yield file
-            part.replace(path)
-        except OSError as error:
-            if error.filename not in (None, str(part), str(path)):
-                raise  # some other file's trouble, met while writing this one
-            raise InputError(_cannot_write(path, error)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def whole_folder(path):
-    """As `whole`, for a folder: gives one to fill, which replaces what is at `path` only if the block succeeds.
-
-    Raises
-    ------
-    InputError
-        If the folder around it does not exist, cannot be written, or runs full.
-    """
-    path = Path(path)
-    part = _new_part(path)
-    try:
-        _remove_stale(path)
-        part.mkdir()
-        handle = os.open(part, os.O_RDONLY)
-        try:
-            _lock(handle)
-            yield part
-            if path.exists():
-                shutil.rmtree(path)
-            part.replace(path)
-        finally:
-            os.close(handle)
-    except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _new_part(path):
-    """A name beside `path` that nobody else has, to write under until it is complete."""
-    return path.with_name(f"{path.name}.btfpipe-{secrets.token_hex(4)}.part")
-
-
-def _lock(handle):
-    """Tell other runs that an open file or folder is in work: False if one of them has told so before.
-
-    The system forgets it when this process ends, however it ends.
-    """
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass  # some network file systems lock nothing
-    return True
-
-
-def _remove_stale(path):
-    """Remove what killed runs left when they wrote `path`: names that only `_new_part` gives, and in nobody's work."""
-    ours = re.compile(re.escape(path.name) + r"\.btfpipe-[0-9a-f]{8}\.part")
-    with contextlib.suppress(OSError):  # a folder that may be written but not listed
-        for name in os.listdir(path.parent):
-            if ours.fullmatch(name):
-                _remove_if_stale(path.with_name(name))
-
-
-def _remove_if_stale(part):
-    try:
-        handle = os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:
-        return
-    try:
-        if _lock(handle):
-            if stat.S_ISDIR(os.fstat(handle).st_mode):
-                shutil.rmtree(part)
-            else:
-                part.unlink()
-    except OSError:
-        pass  # not for us to remove
-    finally:
-        os.close(handle)
-
-
-def _cannot_write(path, error):
-    return f"{path}: cannot be written ({error.strerror}); choose another --out or make room there."
-
-
-def check_writable(path, folder=False):
-    """Find out before the work whether `whole` could write `path`.
-
-    Parameters
-    ----------
-    path : path-like
-    folder : bool
-        Whether a folder of that name would be replaced.
-
-    Raises
-    ------
-    InputError
-        With the sentence that `whole` would give after the work.
-    """
-    path = Path(path)
-    part = _new_part(path)
-    try:
-        if path.is_dir() and not folder:
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        part.open("xb").close()
-        part.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(_cannot_write(path, error)) from error
-
-
-def write_json(path, thing):
-    """Write `thing` as indented JSON, whole or not at all."""
-    with whole(path, "w") as file:
-        put_json(file, thing)
 
 
 def put_json(file, thing):
@@ -265,7 +111,7 @@ def scratch(shape, dtype):
             reserve(file.fileno(), 0, size) if reserve else file.truncate(size)
         except OSError as error:
             raise InputError(
-                f"{tempfile.gettempdir()}: no room for a temporary file of {math.ceil(size / (1 << 20))} MB"
+                f"{tempfile.gettempdir()}: no room for a temporary file of {amount(size)}"
                 f" ({error.strerror}); make room there, choose another folder by TMPDIR, or raise --memory."
             ) from error
         return np.memmap(file, dtype, "r+", shape=tuple(shape))

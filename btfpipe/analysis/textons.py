@@ -32,7 +32,7 @@ from btfpipe.analysis.pyramid import (
     valid_pyramid,
 )
 from btfpipe.compression.svd import SvdModel, compress_svd
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, single_threaded_blas
 
 _SVD_TERMS = 40  # Zhou et al. 2005; used where the input is no SVD already
@@ -90,7 +90,7 @@ def texton_features(
     if need > memory:
         raise InputError(
             f"filter responses of {textures.shape[0]} x {textures.shape[1]} texels and {textures.shape[2]} SVD"
-            f" terms need {need >> 20} MB; --memory allows {memory >> 20} MB. Raise it, or use a Model of fewer"
+            f" terms need {too_little(need, memory)}, or use a Model of fewer"
             " terms (`btfpipe compress --components`)."
         )
     report(1, steps)

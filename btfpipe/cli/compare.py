@@ -5,9 +5,16 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import flag, input_file, material_option, material_taken, progress, stage
+from btfpipe.errors import naming
 
 _WAYS = ("barycentric", "four", "nearest")
+# What they are between the pairs of a list.
+_OF_LISTS = {
+    "barycentric": "nine nearest pairs",
+    "four": "four nearest pairs",
+    "nearest": "nearest pair",
+}
 _DEFINITIONS = {
     "linear": "values as stored, linear Rec. 709",
     "display": "linear values over white, clipped to [0, 1], sRGB curve",
@@ -77,6 +84,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
     """Compress a Sample in many ways: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression.sweep import draw_sweep, sweep
+    from btfpipe.files import whole
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
@@ -94,7 +102,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
             definitions = _DEFINITIONS | {"white": comparison.white_level(sample)[1]}
             about = {"sample": {"file": path.name, "digest": store.digest(path)}}
             store.put_json(
-                files.enter_context(store.whole(out, "w")),
+                files.enter_context(whole(out, "w")),
                 about | facts | {"definitions": definitions},
             )
         if picture is not None:
@@ -102,7 +110,7 @@ def _sweep(path, picture, out, seed, threads, memory, quiet):
                 rows,
                 f"{path.name}: {' x '.join(map(str, sample.shape))} texels, {sample.n_pairs} pairs",
             )
-            files.enter_context(store.whole(picture)).write(_encoded(drawn, picture))
+            files.enter_context(whole(picture)).write(_encoded(drawn, picture))
     if not quiet:
         skipped = {}  # settings by method and reason, which is said once
         for row in rows:
@@ -137,10 +145,12 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
     """Compare a Model with a Sample: report, picture, summary."""
     from btfpipe import store
     from btfpipe.compression import open_appearance
+    from btfpipe.files import whole
     from btfpipe.metrics import comparison, raw_bytes
     from btfpipe.sample import Sample
 
     reference = Sample.open(sample)
+    taken = material_taken(model, material)
     stand_in = open_appearance(model, material)
     ways = _WAYS if "all" in ways else tuple(dict.fromkeys(ways))
     if not ways:
@@ -166,6 +176,8 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
         "ratio": raw / size,
     }
     overall = {name: result.overall() for name, result in results.items()}
+    words = {} if stand_in.is_product else _OF_LISTS
+    shown = {words.get(name, name): result for name, result in results.items()}
     if picture is not None:
         from btfpipe.formats.images import encode_picture
         from btfpipe.metrics.sheet import error_sheet
@@ -174,33 +186,35 @@ def _compare(model, sample, material, ways, picture, out, threads, quiet):
         pictures_of = comparison.model_pictures(
             stand_in, reference, None if first == "own_pairs" else first
         )
-        sheet = encode_picture(error_sheet(reference, results, pictures_of), picture.suffix.lower())
+        sheet = encode_picture(error_sheet(reference, shown, pictures_of), picture.suffix.lower())
     with contextlib.ExitStack() as files:  # both appear, or neither
         if out is not None:
             report = {
-                "model": {"file": model.name, "digest": store.digest(model)}
-                | ({} if material is None else {"material": material}),
+                "model": {"file": model.name, "digest": store.digest(model)} | taken,
                 "sample": {"file": sample.name, "digest": store.digest(sample)},
                 **facts,
-                "definitions": _DEFINITIONS | {"white": white_is},
+                "definitions": _DEFINITIONS
+                | {"white": white_is}
+                | {name: words[name] for name in results if name in words},
                 "comparisons": {
                     name: overall[name] | {"per_pair": _per_pair(result, reference)}
                     for name, result in results.items()
                 },
             }
-            store.put_json(files.enter_context(store.whole(out, "w")), report)
+            store.put_json(files.enter_context(whole(out, "w")), report)
         if picture is not None:
-            files.enter_context(store.whole(picture)).write(sheet)
+            files.enter_context(whole(picture)).write(sheet)
     for name, result in overall.items():
         linear, display = result["linear"], result["display"]
+        relative, ssim = linear["relative_error"], display["ssim"]
         if not quiet:
             click.echo(
-                f"{name}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
-                f" {100 * (linear['relative_error'] or 0):.2f} %; display PSNR {_db(display['psnr_db'])}, SSIM"
-                f" {display['ssim'] if display['ssim'] is None else round(display['ssim'], 4)}",
+                f"{words.get(name, name)}: linear RMSE {linear['rmse']:.5f}, PSNR {_db(linear['psnr_db'])}, relative error"
+                f" {'undefined' if relative is None else f'{100 * relative:.2f} %'}; display PSNR"
+                f" {_db(display['psnr_db'])}, SSIM {'none (no 11 x 11 valid texels)' if ssim is None else round(ssim, 4)}",
                 err=True,
             )
-    return {"inputs": [model, sample], **facts, "comparisons": overall}
+    return {"inputs": [model, sample], **taken, **facts, "comparisons": overall}
 
 
 def _db(value):

@@ -2,7 +2,8 @@
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, Memory, flag, input_file, naming, progress, stage
+from btfpipe.cli.options import FiniteFloat, Memory, flag, input_file, progress, stage, warn
+from btfpipe.errors import naming
 
 # As in btfpipe.compression.METHODS, which is not imported for --help.
 _METHODS = ("coded", "svd", "view-pca", "local-pca", "harmonics", "factored")
@@ -150,9 +151,7 @@ def compress(samples, method, out, seed, threads, memory, quiet, **options):
     }
     model.save(out)
     size = out.stat().st_size
-    if not quiet:
-        for warning in warnings:
-            click.echo(f"Warning: {warning}.", err=True)
+    warn(*warnings)
     own = ("seed", "sample", "sample_bytes", "source", "singular_values")
     return {
         "inputs": list(samples),
@@ -169,6 +168,6 @@ def _names(samples):
     names = [path.name.partition(".")[0] for path in samples]
     if len(set(names)) < len(names):
         raise click.UsageError(
-            f"the materials of a database take the names of their files, and {names} are not all different."
+            f"the materials of a database take the names of their files, and {names} are not all different; rename one."
         )
     return names

@@ -1,11 +1,26 @@
 """`btfpipe export`: a Sample or a Model in a format that others read."""
 
+import re
+
 import click
 
-from btfpipe.cli.options import flag, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import (
+    flag,
+    input_file,
+    material_option,
+    material_taken,
+    progress,
+    stage,
+    warn,
+)
+from btfpipe.errors import naming
 
 # As in btfpipe.formats.targets, which is not imported for --help.
 _FORMATS = ("ubo", "utia", "curet", "rti", "pairs", "btf")
+# Endings that nobody gives to a folder.
+_OF_FILES = re.compile(
+    r"\.(btf|npz|npy|exr|hdr|png|jpe?g|bmp|tiff?|ptm|rti|lp|csv|json|ya?ml|7z|rar|tar|t?gz|z)"
+)
 
 
 @click.command()
@@ -53,6 +68,7 @@ def export(
     from btfpipe.formats import targets
 
     format_ = format_ or ("btf" if out.suffix.lower() == ".btf" else "ubo")
+    _check_ending(out, format_)
     options = {
         "suffix": suffix,
         "sample_number": sample_number,
@@ -64,17 +80,29 @@ def export(
             raise click.UsageError(f"{flag(name)} is not for {format_}.")
     if format_ == "btf":  # factorised on the way
         options |= {"seed": seed, "memory": memory}
+    taken = material_taken(source, material)
     appearance = open_appearance(source, material)
-    if appearance.n_invalid and not quiet:
+    if appearance.n_invalid:
         rows, cols = appearance.shape
-        click.echo(
-            f"Warning: {appearance.n_invalid} of {rows * cols} texels are invalid, which {format_} has no way to say: they"
-            " are written as they are.",
-            err=True,
+        warn(
+            f"{appearance.n_invalid} of {rows * cols} texels are invalid, which {format_} has no way to say: they are"
+            " written as they are"
         )
     with naming(source), progress("export: pictures", quiet) as report:
         facts = targets.write(
             out, format_, appearance, threads=threads, on_progress=report, **options
         )
     invalid = {"invalid_texels": appearance.n_invalid} if appearance.n_invalid else {}
-    return {"inputs": [source], "format": format_, **(facts or {}), **invalid}
+    return {"inputs": [source], "format": format_, **taken, **(facts or {}), **invalid}
+
+
+def _check_ending(out, format_):
+    """Refuse a name whose ending says something else than what the format writes."""
+    ending = out.suffix.lower()
+    if format_ == "btf":
+        if ending != ".btf":
+            raise click.UsageError(f"{out}: btf writes one file; call it NAME.btf.")
+    elif _OF_FILES.fullmatch(ending):
+        raise click.UsageError(
+            f"{out}: {format_} writes a folder of pictures, or NAME.zip with them; call it so."
+        )

@@ -6,6 +6,9 @@ from btfpipe import store
 from btfpipe.cli.options import input_file, progress, stage
 from btfpipe.errors import BtfError
 
+_OF_NAMES = ("arrays", "layers", "settings")  # facts that go by names of the file's own
+_SIZES = ("shape", "size", "plane")  # facts that are written 32 x 32
+
 
 @click.command()
 @click.argument("file", type=input_file())
@@ -58,38 +61,42 @@ def _refusal(file, kind):
     return []
 
 
-def _lines(thing, depth):
-    """Nested facts as indented lines; problems last."""
+def _lines(thing, depth, names=False):
+    """Nested facts as indented lines; problems last. Keys that are `names` stay as they are, others are read as words."""
     indent = "  " * depth
     for key, value in thing.items():
-        name = str(key).replace("_", " ") if depth == 1 else str(key)
+        name = str(key) if names else _words(key)
         if key == "problems":
             yield f"{indent}problems: {'none' if not value else ''}".rstrip()
             yield from (f"{indent}  - {problem}" for problem in value)
-        elif isinstance(value, dict) and value and all(map(_simple, value.values())):
-            inside = ", ".join(f"{k} {_plain(v)}" for k, v in value.items())
+        elif (
+            isinstance(value, dict)
+            and value
+            and not any(isinstance(v, dict) for v in value.values())
+        ):
+            inside = ", ".join(f"{_words(k)} {_plain(v, k)}" for k, v in value.items())
             if len(inside) < 90:
                 yield f"{indent}{name}: {inside}"
             else:
                 yield f"{indent}{name}:"
-                yield from _lines(value, depth + 1)
+                yield from _lines(value, depth + 1, key in _OF_NAMES)
         elif isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
             yield f"{indent}{name}:"
             for number, item in enumerate(value):
                 rest = {k: v for k, v in item.items() if k != "name"}
-                yield from _lines({str(item.get("name", number)): rest}, depth + 1)
+                yield from _lines({str(item.get("name", number)): rest}, depth + 1, True)
         elif isinstance(value, dict) and value:
             yield f"{indent}{name}:"
-            yield from _lines(value, depth + 1)
+            yield from _lines(value, depth + 1, key in _OF_NAMES)
         else:
-            yield f"{indent}{name}: {_plain(value)}"
+            yield f"{indent}{name}: {_plain(value, key)}"
 
 
-def _simple(value):
-    return not isinstance(value, dict)
+def _words(key):
+    return str(key).replace("_", " ")
 
 
-def _plain(value):
+def _plain(value, key=""):
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -99,6 +106,7 @@ def _plain(value):
     if isinstance(value, list):
         if not value:
             return "none"
-        shown = " x ".join if all(isinstance(v, int) for v in value) else ", ".join
-        return shown(_plain(v) for v in value)
+        if all(isinstance(v, int) for v in value):  # as options take them, such as --crop 0 0 32 32
+            return (" x " if str(key).endswith(_SIZES) else " ").join(map(_plain, value))
+        return ", ".join(map(_plain, value))
     return str(value) if value != {} else "none"

@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from btfpipe import store
-from btfpipe.cli.options import FiniteFloat, flag, input_file, naming, progress, stage
-from btfpipe.errors import InputError
+from btfpipe.cli.options import FiniteFloat, flag, input_file, progress, stage, warn
+from btfpipe.errors import InputError, naming
 
 MOST_TEXELS = 16384  # a side
 
@@ -50,7 +50,7 @@ _FORMATS = ("btf", "ptm", "rti", "pairs", "utia", "ubo", "curet", "picture")
 )
 @click.option(
     "--directions",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=input_file(dir_okay=False),
     help="UTIA's list of directions, with the shifted lights of coincident pairs.",
 )
 @click.option(
@@ -186,9 +186,7 @@ def ingest(source, format_, out, threads, quiet, **options):
             facts = ingest_measurement(
                 measurement, out, threads=threads, report=report, about=about, **options
             )
-    if not quiet:
-        for warning in facts.get("warnings", []):
-            click.echo(f"Warning: {warning.rstrip('.')}.", err=True)
+    warn(*facts.get("warnings", []))
     return told | facts
 
 

@@ -16,9 +16,10 @@ import time
 from pathlib import Path
 
 import click
+from numpy.linalg import LinAlgError
 
-from btfpipe import __version__, store
-from btfpipe.errors import BtfError, InputError
+from btfpipe import __version__, files, store
+from btfpipe.errors import BtfError, InputError, NumericalError
 from btfpipe.parallel import available_threads
 
 
@@ -65,7 +66,7 @@ def _common(out):
         click.option("--memory", type=Memory(), default="2G",
                      help="Working memory to stay within, such as 512M or 2G."),
         click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON on stdout."),
-        click.option("-q", "--quiet", is_flag=True, help="No progress, no summary."),
+        click.option("-q", "--quiet", is_flag=True, help="No progress, no summary; warnings stay."),
     ]  # fmt: skip
     if out:
         options.insert(
@@ -109,7 +110,7 @@ def stage(out="required", *, outputs=(), folder=False):
             start = time.perf_counter()
             try:
                 for target in targets:
-                    store.check_writable(target, folder)
+                    files.check_writable(target, folder)
                 facts = command(**{k: v for k, v in common.items() if k in takes}, **kwargs)
                 inputs = [_input(path) for path in facts.pop("inputs", [])]
                 text = facts.pop("text", None)
@@ -123,6 +124,13 @@ def stage(out="required", *, outputs=(), folder=False):
                     err=True,
                 )
                 sys.exit(InputError.exit_code)
+            except LinAlgError as error:  # numpy's, which is scipy's too
+                click.echo(
+                    f"Error: {command.__name__} came upon a matrix that cannot be worked with ({error}); `btfpipe info` may"
+                    " say what is odd about the inputs, and other options of the method may get by.",
+                    err=True,
+                )
+                sys.exit(NumericalError.exit_code)
             summary = {"stage": command.__name__, "btfpipe": __version__, "inputs": inputs}
             if out is not None:
                 summary["out"] = str(out)
@@ -159,15 +167,19 @@ def _paths(kwargs, outputs):
 
 def refuse_inputs(target, inputs):
     """Refuse an output that is an input too, or a folder with one; for inputs that are found late, inside of others."""
-    whole = Path(target).resolve()
+    whole = _end_of_links(target)
     for path in inputs:
-        found = Path(path).resolve()
+        found = _end_of_links(path)
         if found == whole:
             raise click.UsageError(f"{target} is also the input; choose another name to write.")
         if found.is_relative_to(whole):
             raise click.UsageError(
                 f"{target} is a folder that holds the input {path}; choose another name to write."
             )
+
+
+def _end_of_links(path):
+    return Path(os.path.realpath(path))  # which stands links in a ring
 
 
 def _check_targets(targets, inputs, force):
@@ -177,7 +189,7 @@ def _check_targets(targets, inputs, force):
         if target.name in ("", ".."):
             raise click.UsageError(f"{str(target)!r} is no name of a file; give one to write.")
         refuse_inputs(target, inputs)
-        if target.resolve() in {other.resolve() for other in targets[:i]}:
+        if _end_of_links(target) in map(_end_of_links, targets[:i]):
             raise click.UsageError(f"{target} is to be written twice; choose two names.")
         if os.path.exists(target) and not force:
             raise click.UsageError(f"{target} exists; pass --force to replace it.")
@@ -242,9 +254,27 @@ def progress(label, quiet=False):
     yield log
 
 
+def warn(*sentences):
+    """Print sentences on stderr, with --quiet too: they belong to the result."""
+    for sentence in sentences:
+        click.echo(f"Warning: {sentence.rstrip('.')}.", err=True)
+
+
+class _InputPath(click.Path):
+    """A file or folder that is there: no pipe, which can be read but once, and no device."""
+
+    def convert(self, value, param, ctx):
+        path = super().convert(value, param, ctx)
+        if not (path.is_file() or path.is_dir()):
+            self.fail(
+                f"{value} is a pipe or a device; expected a file. Save it as one first.", param, ctx
+            )
+        return path
+
+
 def input_file(**kwargs):
-    """Type of a command's input argument: any existing path."""
-    return click.Path(exists=True, path_type=Path, **kwargs)
+    """Type of a command's input argument: any file or folder that is there."""
+    return _InputPath(exists=True, path_type=Path, **kwargs)
 
 
 def material_option(command):
@@ -256,17 +286,35 @@ def material_option(command):
     )(command)
 
 
+def material_taken(path, material):
+    """Say which material a command takes of a file, if it is a Model of several; warn unless it was named.
+
+    Returns
+    -------
+    dict
+        ``material``, its name, for the summary; nothing of a file with none to choose from.
+
+    Raises
+    ------
+    InputError
+        See `open_appearance`.
+    """
+    from btfpipe.compression import DATABASES, open_appearance
+
+    if not store.is_ours(path) or store.read(path).about.get("method") not in DATABASES:
+        return {}
+    model = open_appearance(path, material)
+    names = list(model.materials)
+    if len(names) == 1:
+        return {}
+    taken = names.pop(model.about["material"])
+    if material is None:
+        warn(
+            f"{path} holds {len(names) + 1} materials; took {taken!r}; --material takes another: {', '.join(names)}"
+        )
+    return {"material": taken}
+
+
 def flag(name):
     """An option as it is typed, from its name in Python."""
     return "--" + name.replace("_", "-")
-
-
-@contextlib.contextmanager
-def naming(path):
-    """Put a file's name in front of what goes wrong in the block, unless the message has it."""
-    try:
-        yield
-    except BtfError as error:
-        if str(path) in str(error):
-            raise
-        raise type(error)(f"{path}: {error}") from error

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, material_option, stage
+from btfpipe.cli.options import input_file, material_option, material_taken, stage
 from btfpipe.errors import InputError
 
 
@@ -57,6 +57,7 @@ def preview(files, columns, exposure, filmic, layer, labels, material, out):
 
     if Path(out).suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"{out}: previews are PNG or JPEG; end the name in .png or .jpg.")
+    taken = material_taken(files[0], material)
     picture, stops = make_preview(
         files,
         columns=columns,
@@ -69,6 +70,7 @@ def preview(files, columns, exposure, filmic, layer, labels, material, out):
     write_picture(out, picture)
     return {
         "inputs": list(files),
+        **taken,
         "width": picture.shape[1],
         "height": picture.shape[0],
         "exposure": stops,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
+from btfpipe.cli.options import input_file, progress, refuse_inputs, stage, warn
 from btfpipe.errors import InputError
 
 # As in the scene's schema, which is not read for --help.
@@ -101,9 +101,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         )
     half = [not full and name[0] in short for name in LAYERS]
     write_picture(out, picture, names=list(LAYERS), half=half)
-    if not quiet:
-        for warning in warnings:
-            click.echo(f"Warning: {warning}.", err=True)
+    warn(*warnings)
     return {
         "inputs": [scene, *loaded.files],
         "width": loaded.film.width,

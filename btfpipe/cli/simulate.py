@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import click
 
-from btfpipe.cli.options import input_file, naming, progress, refuse_inputs, stage
+from btfpipe.cli.options import input_file, progress, refuse_inputs, stage
+from btfpipe.errors import naming
 
 _SUFFIXES = {"jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 

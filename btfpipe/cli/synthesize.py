@@ -4,7 +4,15 @@ import math
 
 import click
 
-from btfpipe.cli.options import FiniteFloat, input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import (
+    FiniteFloat,
+    input_file,
+    material_option,
+    material_taken,
+    progress,
+    stage,
+)
+from btfpipe.errors import naming
 
 _MOST_TEXELS = 16384  # a side
 
@@ -125,6 +133,7 @@ def synthesize(
     if plane and (texels_per_unit or repeats or turn_deg):
         raise click.UsageError("--texels-per-unit, --repeats and --turn-deg are for surfaces.")
     full = search == "full"
+    taken = material_taken(features, material)
     target = None if plane else Surface.open(surface)
     with naming(features):
         sample = read_features(
@@ -158,6 +167,7 @@ def synthesize(
     grown.save(out)
     return {
         "inputs": [path for path in (features, surface) if path is not None],
+        **taken,
         "elements": grown.row.shape[1],
         "texels_per_unit": grown.texels_per_unit,
         **facts,

@@ -2,7 +2,8 @@
 
 import click
 
-from btfpipe.cli.options import input_file, material_option, naming, progress, stage
+from btfpipe.cli.options import input_file, material_option, material_taken, progress, stage
+from btfpipe.errors import naming
 
 
 @click.command()
@@ -65,6 +66,7 @@ def textons(
     from btfpipe.analysis.textons import texton_features
     from btfpipe.compression import open_appearance
 
+    taken = material_taken(source, material)
     appearance = open_appearance(source, material)
     with naming(source), progress("textons", quiet) as report:
         features = texton_features(
@@ -82,7 +84,6 @@ def textons(
         )
     facts = dict(features.about)
     features.about |= {"sample_digest": store.digest(source), "source": source.name, "seed": seed}
-    if material is not None:
-        features.about["material"] = material
+    features.about |= taken
     features.save(out)
-    return {"inputs": [source], **facts, "bytes": out.stat().st_size}
+    return {"inputs": [source], **taken, **facts, "bytes": out.stat().st_size}

@@ -5,7 +5,7 @@ import importlib
 from collections import namedtuple
 
 from btfpipe import store
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.sample import Sample
 
 # A method of compression: its module, the class of its Models, the function that makes one (None for Models that only come from
@@ -115,10 +115,8 @@ def choose_material(appearance, material, path):
         raise no_database(path)
     if material not in appearance.materials and str(material).isdecimal():
         material = int(material)
-    try:
+    with naming(path):
         return appearance.material(material)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def no_database(path):

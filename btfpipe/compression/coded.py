@@ -31,7 +31,7 @@ from btfpipe.compression.model import (
     tables,
 )
 from btfpipe.compression.svd import SvdModel, factorise
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import ShadingNeeds
@@ -107,10 +107,7 @@ class CodedModel(Model):
             for name in ("view", "light"):
                 count = len(getattr(source, f"{name}_directions"))
                 members[f"{name}_basis"] = reader.require(f"{name}_basis", (count, None), "f")
-        try:
-            return cls(members, source, about)
-        except InputError as error:
-            raise InputError(f"{reader.path}: {error}") from error
+        return cls(members, source, about)
 
     def pictures(self, pairs):
         texture = self.texture_factors.reshape(-1, self.n_terms)
@@ -239,8 +236,7 @@ def compress_coded(
     need = (104 << 20) + 4 * 4 * most * lengths + comparison_bytes(sample)
     if need > memory:
         raise InputError(
-            f"{most} terms of {lengths} numbers need {math.ceil(need / (1 << 20))} MB; --memory allows"
-            f" {memory >> 20} MB. Raise it, or ask for fewer terms."
+            f"{most} terms of {lengths} numbers need {too_little(need, memory)}, or ask for fewer terms."
         )
     search = math.ceil(_SEARCH * sample.n_pairs)
     report = on_progress or (lambda done, total: None)

@@ -24,7 +24,7 @@ from numba import njit
 from btfpipe import store
 from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
@@ -74,10 +74,7 @@ class HarmonicsModel(Model):
         if codes.dtype != np.uint8:
             raise InputError(f"{reader.path}: codes are {codes.dtype}; expected uint8.")
         for terms in codes.shape[3:]:
-            try:
-                highest_degree(terms)
-            except InputError as error:
-                raise InputError(f"{reader.path}: {error}") from error
+            highest_degree(terms)
         minimum = reader.require("minimum", codes.shape[2:], "f")
         maximum = reader.require("maximum", codes.shape[2:], "f")
         return cls(codes, minimum, maximum, source, reader.about)
@@ -240,8 +237,8 @@ class _Fit:
         count = len(basis)
         if terms > count:
             raise InputError(
-                f"{terms} terms over {count} {what}: more than there are. {supported(directions)} terms are"
-                f" what these directions support."
+                f"{terms} terms over {count} {what}: more than there are. Pass --{what[:-1]}-harmonics {supported(directions)}, which"
+                " is what these directions support."
             )
         weights = np.broadcast_to(weights, count)
         root = np.sqrt(weights / weights.mean())[:, None]
@@ -379,8 +376,8 @@ class _Lines:
         need = fixed + line + each
         if need > memory:
             raise InputError(
-                f"{self.terms[0]} x {self.terms[1]} terms of {texels} texels need {math.ceil(need / (1 << 20))} MB;"
-                f" --memory allows {memory >> 20} MB. Raise it, or ask for fewer terms."
+                f"{self.terms[0]} x {self.terms[1]} terms of {texels} texels need"
+                f" {too_little(need, memory)}, or ask for fewer terms."
             )
         free = memory - fixed
         self.at_once = max(1, min((free - line) // each, 2 * self.threads))

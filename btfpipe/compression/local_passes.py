@@ -13,7 +13,7 @@ from btfpipe.compression.svd import (
     _require_range,
     planar_pictures,
 )
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, ordered_map
 
 REDUCED_TERMS = 150  # of each sample, for the clustering
@@ -48,8 +48,7 @@ def plan(samples, clusters, components, precision, threads, memory):
     if need > memory:
         raise InputError(
             f"{clusters} clusters of {components} components and {texels} texels need"
-            f" {math.ceil(need / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
-            " or ask for fewer clusters."
+            f" {too_little(need, memory)}, or ask for fewer clusters."
         )
     at_once = int(min((memory - fixed) // each, 2 * threads))
     return step, at_once, min(threads, at_once)

@@ -23,7 +23,7 @@ from btfpipe.compression.local_passes import (
 )
 from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.resample import Resampled
@@ -385,10 +385,8 @@ def _resample(samples, names, allowed):
                 f"a database needs samples of equal directions; {name} has {difference}."
                 " Compress them apart, or pass --resample."
             )
-        try:
+        with naming(name):
             samples[number] = Resampled(sample, first)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
         resampled[name] = {
             "lights": len(sample.light_directions),
             "views": len(sample.view_directions),

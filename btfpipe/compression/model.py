@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe import store
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import Appearance
 from btfpipe.sample.sample import check_index, read_directions
@@ -56,12 +56,8 @@ class Model(Appearance):
     @classmethod
     def from_reader(cls, reader):
         """Map the Model from its file."""
-        try:
+        with naming(reader.path):
             model = cls.from_arrays(reader, read_tables(reader))
-        except InputError as error:
-            if str(reader.path) in str(error):
-                raise
-            raise InputError(f"{reader.path}: {error}") from error  # of a constructor
         if not model.n_pairs or 0 in model.shape:
             raise InputError(f"{reader.path}: holds no pair, or no texel.")
         mask = model.mask
@@ -100,11 +96,9 @@ def read_tables(reader):
     lights, views = read_directions(reader)
     if "light_index" in reader:
         index = [reader.require(name, (None,), "iu") for name in _TABLES[2:]]
-        try:
+        with naming(reader.path):
             for name, table, directions in zip(_TABLES[2:], index, (lights, views), strict=True):
                 check_index(name, table, len(directions), len(index[0]))
-        except InputError as error:
-            raise InputError(f"{reader.path}: {error}") from error
     else:
         pair = np.arange(len(lights) * len(views), dtype=np.int32)
         index = [pair % len(lights), pair // len(lights)]

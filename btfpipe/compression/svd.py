@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.transfer import decode_table
@@ -365,8 +365,8 @@ class _Passes:
         need = fixed + max(4 * vectors, 2 * vectors + each)
         if need > memory:
             raise InputError(
-                f"{width} vectors of {self.texels} texels need {math.ceil(need / (1 << 20))} MB; --memory"
-                f" allows {memory >> 20} MB. Raise it, or ask for fewer components."
+                f"{width} vectors of {self.texels} texels need"
+                f" {too_little(need, memory)}, or ask for fewer components."
             )
         self.at_once = int(min((memory - fixed - 2 * vectors) // each, 2 * threads))
         self.threads = min(threads, self.at_once)

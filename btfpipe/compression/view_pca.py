@@ -20,7 +20,7 @@ from btfpipe.compression.model import (
     sum_of_squares,
 )
 from btfpipe.compression.svd import _PROCESS_BYTES, planar_pictures
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import ShadingNeeds
 from btfpipe.sample.shading import PairShader, corners
@@ -229,8 +229,7 @@ def _plan(sample, shapes, dtypes, threads, memory):
     if _PROCESS_BYTES + each > memory:
         raise InputError(
             f"views of {lights} pictures of {texels} texels need"
-            f" {math.ceil((_PROCESS_BYTES + each) / (1 << 20))} MB; --memory allows {memory >> 20} MB. Raise it,"
-            " or ask for fewer components."
+            f" {too_little(_PROCESS_BYTES + each, memory)}, or ask for fewer components."
         )
     free = memory - _PROCESS_BYTES
     inside = size + each <= free

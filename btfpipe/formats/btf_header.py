@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from btfpipe.directions import from_angles
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.sample.colour import spectrum_to_rgb
 
 _LEGACY_PVF = 301074
@@ -210,10 +210,8 @@ def _read_wavelengths(file, header, names):
             " that are wavelengths in nanometres."
         )
     wavelengths = np.array([float(match[1]) for match in found])
-    try:
+    with naming(f"{file.path}: channels"):
         header.to_rgb = spectrum_to_rgb(wavelengths).astype(np.float32)
-    except InputError as error:
-        raise InputError(f"{file.path}: channels: {error}") from error
     header.facts["spectra"] = (
         f"{header.n_channels} wavelengths, {wavelengths.min():g} to {wavelengths.max():g} nm, as seen under D65"
     )

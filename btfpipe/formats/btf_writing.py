@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from btfpipe import store
+from btfpipe import files
 from btfpipe.compression.factored import EPSILON, SPACES, FactoredModel, compress_factored
 from btfpipe.directions import to_angles
 from btfpipe.errors import InputError
@@ -52,7 +52,7 @@ def write_btf(
         precision than those given.
     """
     appearance.require_product("a .btf file")
-    store.check_writable(path)
+    files.check_writable(path)
     model = appearance
     if isinstance(model, FactoredModel):
         _require_own(model, terms, space, precision)
@@ -68,7 +68,7 @@ def write_btf(
         for directions in (model.light_directions, model.view_directions)
     )
     rows, cols = model.shape
-    with store.whole(path) as file:
+    with files.whole(path) as file:
         file.write(b"!DFMF08FCR" + _meta(model, flag))
         lights = struct.pack("<I", len(light)) + _signed(light)
         file.write(struct.pack("<I", len(view)))

@@ -3,11 +3,13 @@
 A description names everything that is wrong, where `ingest` stops at the first thing.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
 
 from btfpipe.compression.model import Model
+from btfpipe.description import read_description
 from btfpipe.directions import from_angles
 from btfpipe.errors import InputError
 from btfpipe.formats import sources
@@ -20,6 +22,15 @@ from btfpipe.parallel import ordered_map
 from btfpipe.sample.describe import describe_directions, describe_pairs
 
 _LISTED = 20
+# What a file of keys and values is, by one of its keys.
+_DESCRIPTIONS = {
+    "objects": "a scene, which `btfpipe render` reads",
+    "structure": "a specification, which `btfpipe simulate` reads",
+    "strokes": "strokes, which `btfpipe surface --field` reads",
+    "comparisons": "a report of `btfpipe compare`",
+    "sweep": "a report of `btfpipe compare --sweep`",
+    "results": "a configuration of the workflow, for `snakemake --configfile`",
+}
 
 
 def describe_foreign(path, threads=1, report=lambda done, total: None):
@@ -31,6 +42,9 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
         ``kind``, facts, and ``problems``: a list of sentences.
     """
     path = Path(path)
+    description = _describe_description(path)
+    if description is not None:
+        return description
     name, reason = sources.recognise(path)
     if name not in ("ubo", "picture"):
         return _describe_source(path, name, reason, threads, report)
@@ -56,6 +70,28 @@ def describe_foreign(path, threads=1, report=lambda done, total: None):
             "problems": [str(error)],
         }
     return describe_picture(picture, path)
+
+
+def _describe_description(path):
+    """Describe a file of keys and values that this project reads or writes; None of what may be something else."""
+    ending = path.suffix.lower()
+    if ending not in (".yaml", ".yml", ".json") or not path.is_file():
+        return None
+    try:
+        if ending == ".json":
+            thing = json.loads(path.read_bytes())
+        else:
+            thing = read_description(path, "a description")
+    except InputError as error:
+        return {"kind": "description", "problems": [str(error)]}
+    except (OSError, ValueError, RecursionError):
+        return None  # a list of directions, perhaps, whose reader says what is wrong
+    keys = [str(key) for key in thing] if isinstance(thing, dict) else []
+    what = next((what for key, what in _DESCRIPTIONS.items() if key in keys), None)
+    if what is None and ending == ".json":
+        return None
+    what = what or f"nothing that btfpipe reads; none of its keys is {', '.join(_DESCRIPTIONS)}"
+    return {"kind": "description", "what": what, "keys": keys, "problems": []}
 
 
 def _describe_source(path, name, reason, threads, report):

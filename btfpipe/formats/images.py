@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from btfpipe import store
 from btfpipe.errors import InputError
+from btfpipe.files import whole
 from btfpipe.formats.rgbe import decode_rgbe
 
 _MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
@@ -326,7 +326,7 @@ def write_picture(path, picture, **options):
     # not by the library itself, which takes a full disk in silence for some formats
     with (
         _encoded(picture, Path(path).suffix.lower(), **options) as encoded,
-        store.whole(path) as file,
+        whole(path) as file,
     ):
         with encoded.open("rb") as data:
             shutil.copyfileobj(data, file, 1 << 20)

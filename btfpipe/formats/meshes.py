@@ -288,7 +288,7 @@ def _read_stl(path, data):
 
 def write_obj(path, vertices, faces):
     """Write a mesh as OBJ with 5 decimals; the same mesh gives the same bytes."""
-    from btfpipe.store import whole
+    from btfpipe.files import whole
 
     with whole(path, "w") as file:
         file.writelines(f"v {x:.5f} {y:.5f} {z:.5f}\n" for x, y, z in vertices)

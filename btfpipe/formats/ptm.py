@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from btfpipe.compression.relighting import TERMS, RelightingModel
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.formats.images import Decoder
 
 _MOST_HEADER = 1 << 16
@@ -249,7 +249,5 @@ def _upright(path, codes, scale, offset, colour, basis, transfer, version):
     codes = np.ascontiguousarray(codes[::-1])
     colour = None if colour is None else np.ascontiguousarray(colour[::-1])
     about = {"source": {"format": version, "source_transfer": transfer}}
-    try:
+    with naming(path):
         return RelightingModel(codes, scale, offset, colour, basis, transfer, about=about)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -108,7 +108,8 @@ class Listing:
             )
             raise InputError(
                 f"{path}: holds no pictures with light and view angles in their names ({seen}); expected names such"
-                " as '00008 tl000 pl000 tv030 pv030.jpg'."
+                " as '00008 tl000 pl000 tv030 pv030.jpg', or beside the pictures a CSV with the columns name, theta_l, phi_l, theta_v,"
+                " phi_v, or an .lp list; a picture by itself is ingested by naming it."
             )
         if self.duplicates:
             first, second = self.duplicates[0]

@@ -132,7 +132,7 @@ def open_measurement(path, *, pairs=False, directions=None, colour=None):
         elif facts["coincident_pairs"] and settings.get("layout") != _LAYOUT:
             facts["warnings"] = [
                 f"{facts['coincident_pairs']} pairs have their light where their view is; their true lights stood"
-                " aside, as the set's list of directions says. Without it the nominal ones are kept."
+                " aside, as the set's list of directions says. Without it (--directions LIST) the nominal ones are kept."
             ]
 
         def rgb(picture, label):

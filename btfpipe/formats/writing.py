@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from btfpipe import store
+from btfpipe import files, store
 from btfpipe.directions import to_angles
 from btfpipe.errors import InputError
 from btfpipe.formats.images import encode_picture
@@ -52,7 +52,7 @@ def create_set(path, settings):
         names.add(name)
 
     if path.suffix.lower() == ".zip":
-        with store.whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        with files.whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
 
             def pack(name, data):
                 once(name)
@@ -67,7 +67,7 @@ def create_set(path, settings):
         raise InputError(
             f"{path}: is there and was not written by btfpipe (no {SETTINGS} in it); choose another --out."
         )
-    with store.whole_folder(path) as part:
+    with files.whole_folder(path) as part:
 
         def put(name, data):
             once(name)

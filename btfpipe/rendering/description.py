@@ -1,11 +1,10 @@
 """Reading the scene's YAML: a closed schema, errors that name the key, files filled in."""
 
-import contextlib
 from importlib import resources
 from pathlib import Path
 
 from btfpipe import description
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 
 
 def read_description(path, bindings=None):
@@ -54,13 +53,9 @@ def read_description(path, bindings=None):
     return scene
 
 
-@contextlib.contextmanager
 def naming_entry(part, number):
     """Say in front of what is wrong inside the block which of the scene's lights or objects it is."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{part}[{number}]: {error}") from error
+    return naming(f"{part}[{number}]")
 
 
 def _file(scene, where, value, bindings):

@@ -207,4 +207,6 @@ def _tile_of(film, slice_bytes, ray_bytes):
 
 
 def _size(count):
+    if count < 2**20:
+        return f"{count // 2**10} KiB"
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{math.ceil(count / 2**20)} MiB"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from btfpipe.compression import no_database, open_appearance
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 from btfpipe.sample.transfer import encode
 
 GAP = 4  # pixels between the pictures of a sheet
@@ -319,12 +319,8 @@ def preview(
             )
         if layer != "colour":
             raise InputError(f"{paths[0]}: a Sample or Model has no layer {layer}.")
-        try:
+        with naming(paths[0]):
             linear, names, columns_found = sample_sheet(open_appearance(paths[0], material))
-        except InputError as error:
-            if str(paths[0]) in str(error):
-                raise
-            raise InputError(f"{paths[0]}: {error}") from error
         columns = columns or columns_found
     else:
         channels = [read_channels(p) for p in paths]

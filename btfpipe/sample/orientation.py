@@ -33,11 +33,3 @@ def texels_to_step(drow, dcol, angle):
     cosine = np.cos(angle)
     sine = np.sin(angle)
     return dcol * cosine + drow * sine, dcol * sine - drow * cosine
-
-
-@njit(cache=True, inline="always")
-def turn_into_sample(x, y, angle):
-    """Direction (x, y) of the local frame, seen in the frame of a sample that lies at `angle`."""
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    return x * cosine + y * sine, y * cosine - x * sine

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfpipe import parallel
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, too_little
 from btfpipe.sample.transfer import encode
 from btfpipe.simulation.tracing import copies
 
@@ -51,8 +51,8 @@ def require_memory(patch, rays, memory):
     needed = int(len(patch.faces) * copies(patch) * 150 + len(patch.normals) * (14 * rays + 100))
     if needed > memory:
         raise InputError(
-            f"{len(patch.normals)} vertices with {rays} rays each need about {needed >> 20} MB; --memory allows"
-            f" {memory >> 20} MB. Raise it, or lower vertices_per_texel or inter_reflection.rays."
+            f"{len(patch.normals)} vertices with {rays} rays each need about"
+            f" {too_little(needed, memory)}, or lower vertices_per_texel or inter_reflection.rays."
         )
     return needed
 
@@ -84,8 +84,7 @@ def capture(goniometer, lights, views, pairs, finish, threads=1, memory=2 << 30)
     per_light = goniometer.bytes_per_light
     if per_light > memory:
         raise InputError(
-            f"one light needs {per_light >> 20} MB of tables; --memory allows {memory >> 20} MB. Raise it, or lower"
-            " vertices_per_texel."
+            f"the tables of one light need {too_little(per_light, memory)}, or lower vertices_per_texel."
         )
     used = np.unique(pairs[:, 1])
     for block in parallel.blocks(len(used), max(int(memory // per_light), 1)):

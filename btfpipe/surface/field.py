@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, NumericalError
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.surface.topology import edges, face_components
 
@@ -233,12 +233,17 @@ def _factor(matrix, shift):
     from scipy.sparse import identity
     from scipy.sparse.linalg import splu
 
-    return splu(
-        (matrix + shift * identity(matrix.shape[0])).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    ).solve
+    try:
+        return splu(
+            (matrix + shift * identity(matrix.shape[0])).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        ).solve
+    except RuntimeError as error:
+        raise NumericalError(
+            f"the vector field's matrix cannot be factorised ({error}); ask for other --vertices."
+        ) from error
 
 
 def _normalised(x, component, count):

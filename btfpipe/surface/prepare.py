@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
 from btfpipe.surface.pyramid import parents
@@ -87,12 +87,10 @@ def prepare(
     levels = []
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
-        try:
+        with naming(name):
             fine, place, weights = resample(
                 source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
             )
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
         if i == 0:
             _check_count(name, len(place), wanted, len(euler))
         normals = source.normals(place, weights)
@@ -109,10 +107,8 @@ def prepare(
         )
         fallbacks.append(missed)
     report(n_levels, n_levels + 1)
-    try:
+    with naming(name):
         _lay_field(levels, strokes, turn)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
     finest = levels[0]
     index = field.singularities(finest.faces, finest.normals, finest.tangents)
     pair = edges(finest.faces)
@@ -153,10 +149,9 @@ def _check_memory(name, n_vertices, memory):
     need = _PROCESS_BYTES + _BYTES_A_VERTEX * n_vertices
     if need > memory:
         fits = max(0, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
-        advice = f"ask for at most {fits} with --vertices" if fits >= 100 else "raise it"
+        advice = f", or ask for at most {fits} with --vertices" if fits >= 100 else ""
         raise InputError(
-            f"{name}: {n_vertices} vertices need about {need >> 20} MB; --memory allows {memory >> 20} MB:"
-            f" {advice}{', or raise it' if fits >= 100 else ''}."
+            f"{name}: {n_vertices} vertices need about {too_little(need, memory)}{advice}."
         )
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, naming
 
 _DIMENSIONS = 16  # of the appearance of a BTF's texel that plain features keep
 
@@ -67,7 +67,7 @@ def read_features(
 
             picture = open_picture(path)
             image = np.asarray(colours(picture, path), np.float32)
-        try:
+        with naming(path):
             features = plain_features(
                 image,
                 toroidal,
@@ -76,8 +76,6 @@ def read_features(
                 sample_digest=store.digest(path),
                 source=path.name,
             )
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
     if k is not None and k > 1 and any(level.neighbours is None for level in features.levels):
         about = features.about
         add_neighbour_lists(

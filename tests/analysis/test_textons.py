@@ -250,7 +250,7 @@ def test_not_a_number_is_refused_with_its_place(model):
 
 
 def test_responses_beyond_the_memory_are_refused_before_filtering(model):
-    with pytest.raises(InputError, match="--memory allows 0 MB"):
+    with pytest.raises(InputError, match="--memory allows 97 KB"):
         texton_features(model, levels=1, memory=100_000)
 
 

@@ -9,6 +9,7 @@ from btfpipe.compression.svd import compress_svd
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
 from btfpipe.formats.images import read_picture
+from btfpipe.sample import Sample
 
 
 @pytest.fixture
@@ -137,3 +138,28 @@ def test_the_picture_replaces_no_input(btfpipe, files, make_sample):
         "compare", files / "m.npz", files / "s.png", "--picture", files / "s.png", "-f", code=2
     )
     assert "is also the input" in done.stderr
+
+
+def test_what_has_no_error_or_no_likeness_is_called_so(btfpipe, files, make_sample):
+    sample = make_sample(8, 8)
+    sample.save(files / "small.npz")
+    sample.codes[:] = 0
+    sample.save(files / "black.npz")
+    said = btfpipe("compare", files / "small.npz", files / "black.npz").stderr
+    assert "relative error undefined; display" in said
+    assert "SSIM none (no 11 x 11 valid texels)\n" in said
+
+
+def test_of_lists_the_nearest_pairs_are_what_is_reported(btfpipe, files, make_sample):
+    full = make_sample(dtype=np.uint8, transfer="srgb")
+    keep = np.arange(0, full.n_pairs, 2)
+    Sample(
+        full.codes[keep], full.light_directions, full.view_directions, full.light_index[keep],
+        full.view_index[keep], transfer="srgb",
+    ).save(files / "list.npz")  # fmt: skip
+    ask = ("compare", files / "list.npz", files / "s.npz")
+    assert btfpipe(*ask, "-o", files / "r.json").stderr.startswith("nine nearest pairs: linear")
+    report = json.loads((files / "r.json").read_text())
+    assert list(report["comparisons"]) == ["barycentric"]
+    assert report["definitions"]["barycentric"] == "nine nearest pairs"
+    assert "\nnearest pair: linear" in btfpipe(*ask, "--interpolation", "all").stderr

@@ -79,6 +79,10 @@ def test_a_rank_below_the_components_is_a_warning(btfpipe, make_sample, tmp_path
     facts = json.loads(done.stdout)
     assert facts["n_terms"] == 3
     assert "2 terms left out" in facts["warnings"][0]
+    quiet = btfpipe(
+        "compress", tmp_path / "s.npz", "-o", tmp_path / "n.npz", *SVD, "--components", 5, "-q"
+    )
+    assert quiet.stderr == f"Warning: {facts['warnings'][0]}.\n"
 
 
 def test_one_picture_of_one_view_and_light_compresses(btfpipe, make_sample, tmp_path):
@@ -250,3 +254,9 @@ def test_svd_in_a_space_counts_terms_by_channel(btfpipe, sample_file, tmp_path):
         "compress", sample_file, "-o", tmp_path / "m.npz", *SVD, "--precision", "byte", code=2
     )
     assert "no --precision byte" in done.stderr
+
+
+def test_materials_of_one_name_are_refused_with_the_way_out(btfpipe, sample_file, tmp_path):
+    method = ("--method", "local-pca", "-o", tmp_path / "m.npz")
+    done = btfpipe("compress", sample_file, sample_file, *method, code=2)
+    assert "are not all different; rename one." in done.stderr

@@ -127,3 +127,27 @@ def test_every_format_of_the_tables_is_offered():
     assert set(ingest._FORMATS) == set(FORMATS)
     assert set(export._FORMATS) == set(WRITERS)
     assert set(compress._METHODS) == {name for name, m in METHODS.items() if m.function}
+
+
+@pytest.mark.parametrize(
+    ("format_", "name", "expected"),
+    [
+        ("ubo", "weave.btf", "ubo writes a folder of pictures, or NAME.zip"),
+        ("btf", "x.zip", "btf writes one file; call it NAME.btf"),
+        ("btf", "x", "btf writes one file; call it NAME.btf"),
+        (None, "weave.exr", "ubo writes a folder of pictures, or NAME.zip"),
+        ("pairs", "list.CSV", "pairs writes a folder of pictures, or NAME.zip"),
+    ],
+)
+def test_an_ending_that_says_another_format_is_wrong_usage(
+    btfpipe, small, tmp_path, format_, name, expected
+):
+    options = ["--format", format_] if format_ else []
+    done = btfpipe("export", small, *options, "-o", tmp_path / name, code=2)
+    assert f"{tmp_path / name}: {expected}" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["s.npz"]
+
+
+def test_a_folder_may_have_a_dot_in_its_name(btfpipe, small, tmp_path):
+    btfpipe("export", small, "-o", tmp_path / "wool_1.5mm")
+    assert (tmp_path / "wool_1.5mm").is_dir()

@@ -260,7 +260,7 @@ def test_without_json_a_person_reads_it_on_stdout(btfpipe, make_sample, make_mea
     result = btfpipe("info", tmp_path / "s.npz")
     assert result.stderr == ""
     assert result.stdout.startswith(f"{tmp_path / 's.npz'}:\n  kind: sample\n")
-    assert "rings_deg: 0 1, 15 6\n" in result.stdout
+    assert "rings deg: 0 1, 15 6\n" in result.stdout
     assert result.stdout.endswith("problems: none\n")
     path, _ = make_measurement(change=lambda m: m.pop(next(iter(m))))
     assert (
@@ -375,3 +375,47 @@ def test_a_model_with_a_wrong_index_is_refused_like_a_sample(
     message = f"m.npz: {table} runs from 0 to 9999 over 100 pairs"
     assert message in btfpipe("info", path).stdout
     assert message in btfpipe("preview", path, "-o", tmp_path / "p.png", code=3).stderr
+
+
+def test_a_crop_is_written_as_its_option_and_keys_as_words(btfpipe, make_measurement, tmp_path):
+    path, _ = make_measurement()
+    btfpipe("ingest", path, "--crop", 0, 1, 4, 5, "-o", tmp_path / "s.npz")
+    said = btfpipe("info", tmp_path / "s.npz").stdout
+    assert "      crop: 0 1 4 5\n" in said
+    assert "      source size: 6 x 8\n" in said
+    assert "    light_directions: shape 3 x 3, dtype float64, not finite 0\n" in said
+    keys = [line.partition(":")[0] for line in said.splitlines()[1:]]
+    arrays = store.read(tmp_path / "s.npz").names()
+    assert {key.strip() for key in keys if "_" in key} == {name for name in arrays if "_" in name}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("a.yaml", "objects: []\nlights: []\n", "a scene, which `btfpipe render` reads"),
+        ("a.yml", "structure: {}\n", "a specification, which `btfpipe simulate` reads"),
+        ("a.yaml", "strokes: []\n", "strokes, which `btfpipe surface --field` reads"),
+        ("a.json", '{"comparisons": {}}', "a report of `btfpipe compare`"),
+        (
+            "a.yaml",
+            "other: 1\n",
+            "nothing that btfpipe reads; none of its keys is objects, structure",
+        ),
+    ],
+)
+def test_descriptions_are_told_from_pictures(btfpipe, info, tmp_path, name, text, what):
+    (tmp_path / name).write_text(text)
+    said = info(tmp_path / name)
+    assert (said["kind"], said["problems"]) == ("description", [])
+    assert said["what"].startswith(what)
+
+
+def test_a_description_that_is_not_yaml_is_a_problem(info, tmp_path):
+    (tmp_path / "a.yaml").write_text("a: [1\n")
+    assert "not YAML" in info(tmp_path / "a.yaml")["problems"][0]
+
+
+@pytest.mark.parametrize("text", ["{", "[1, 2]", '{"x": 1}', "[" * 100_000])
+def test_other_json_is_taken_for_a_list_of_directions(info, tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    assert info(tmp_path / "a.json")["kind"] == "pairs source"

@@ -63,7 +63,10 @@ def no_pictures(members):
         (missing, ["tl30 pl90 tv45 pv180", "1 of 6", "--pairs"]),
         (twice, ["tl030 pl090 tv045 pv180.png", "TL30_PL90_TV45_PV180.png"]),
         (outside, ["../../etc/tl030", "outside"]),
-        (no_pictures, ["readme.txt", "tl000 pl000 tv030 pv030"]),
+        (
+            no_pictures,
+            ["readme.txt", "tl000 pl000 tv030 pv030", "name, theta_l", ".lp list", "naming it"],
+        ),
     ],
 )
 def test_bad_sets_end_in_one_clear_sentence_and_no_file(
@@ -194,7 +197,7 @@ def test_an_output_that_is_a_folder_is_one_clear_sentence(btfpipe, make_measurem
     path, _ = make_measurement()
     (tmp_path / "s.npz").mkdir()
     result = btfpipe("ingest", path, "-o", tmp_path / "s.npz", "--force", code=3)
-    assert "cannot be written (Is a directory)" in result.stderr
+    assert "cannot be written (a folder is there)" in result.stderr
     assert [p.name for p in tmp_path.glob("s.npz*")] == ["s.npz"]
 
 
@@ -247,7 +250,7 @@ def test_a_misspelt_setting_is_told_by_name(btfpipe, make_measurement, make_samp
         settings = json.loads((sets[-1] / "btfpipe.json").read_text())
         (sets[-1] / "btfpipe.json").write_text(json.dumps(settings | {"whiteness": 1}))
     for path in sets:
-        done = btfpipe("ingest", path, "-o", tmp_path / "t.npz", "--force")
+        done = btfpipe("ingest", path, "-o", tmp_path / "t.npz", "--force", "-q")
         assert (
             "Warning: unknown settings 'whiteness' in btfpipe.json; expected white" in done.stderr
         )

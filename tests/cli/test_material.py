@@ -114,3 +114,19 @@ def test_what_is_no_model_at_all_has_no_materials(btfpipe, folder):
 def test_a_sweep_has_no_material(btfpipe, folder):
     done = btfpipe("compare", "--sweep", folder / "wool.npz", "--material", 0, code=2)
     assert "leave --material out" in done.stderr
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "compare"])
+def test_a_material_taken_unasked_is_named_with_the_others(btfpipe, folder, name):
+    command, *options = COMMANDS.get(name, (name, folder / "wool.npz"))
+    out = folder / f"out{ENDINGS.get(name, '.out.npz')}"
+    options += ["-o", out, "-q", "--json", "--force"]
+    for ask, taken, warnings in (
+        (["cloth.npz"], "wool", f"Warning: {folder / 'cloth.npz'} holds 2 materials; took 'wool';"
+         " --material takes another: felt.\n"),
+        (["cloth.npz", "--material", 0], "wool", ""),
+        (["wool.npz"], None, ""),
+    ):  # fmt: skip
+        done = btfpipe(command, folder / ask[0], *options, *ask[1:])
+        assert done.stderr == warnings
+        assert json.loads(done.stdout).get("material") == taken

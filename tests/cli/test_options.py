@@ -1,6 +1,7 @@
 """What every command shares, seen through small commands made here and through real ones."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from btfpipe import store
-from btfpipe.cli.options import FiniteFloat, input_file, naming, stage
-from btfpipe.errors import InputError, NumericalError
+from btfpipe.cli.options import FiniteFloat, input_file, stage, warn
+from btfpipe.errors import NumericalError
 
 
 def command(body, out="optional", **options):
@@ -95,6 +95,51 @@ def test_too_little_memory_is_one_sentence():
     assert done.stderr.count("\n") == 1
 
 
+def test_a_matrix_that_cannot_be_solved_is_one_sentence_and_exit_code_4(
+    btfpipe, make_sample, tmp_path, monkeypatch
+):
+    def fail(*args, **kwargs):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    make_sample(8, 8).save(tmp_path / "s.npz")
+    monkeypatch.setattr(np.linalg, "eigh", fail)
+    done = btfpipe("compress", tmp_path / "s.npz", "-o", tmp_path / "m.npz", "-q", code=4)
+    assert done.stderr.startswith("Error: compress came upon a matrix that cannot be worked with")
+    assert "(Eigenvalues did not converge)" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["s.npz"]
+
+
+def test_a_vector_field_that_cannot_be_factorised_is_exit_code_4(monkeypatch):
+    import scipy.sparse.linalg
+
+    from btfpipe.surface import field
+
+    def fail(*args, **kwargs):
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(scipy.sparse.linalg, "splu", fail)
+    with pytest.raises(NumericalError, match=r"factorised \(Factor is exactly singular\)"):
+        field._factor(scipy.sparse.identity(3), 0.0)
+
+
+def test_a_pipe_is_no_input(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    result = run(command(lambda out: None), tmp_path / "pipe")
+    assert result.exit_code == 2
+    assert "pipe is a pipe or a device; expected a file" in result.stderr
+
+
+@pytest.mark.parametrize("options", [[], ["-q"], ["-q", "--json"]])
+def test_warnings_are_told_to_those_who_want_it_quiet_too(options):
+    def body(out):
+        warn("it is dark.", "it is cold")
+
+    done = run(command(body), *options)
+    assert "Warning: it is dark.\nWarning: it is cold.\n" in done.stderr
+    assert "Warning" not in done.stdout
+
+
 def test_an_input_is_never_an_output_even_with_force(tmp_path):
     (tmp_path / "a").write_text("mine")
     (tmp_path / "link").symlink_to(tmp_path / "a")
@@ -154,7 +199,7 @@ def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
     made = command(lambda out: done.append(out))
     result = run(made, option, tmp_path / "folder", "--force")
     assert result.exit_code == 3
-    assert "folder: cannot be written (Is a directory)" in result.stderr
+    assert "folder: cannot be written (a folder is there)" in result.stderr
     result = run(made, option, tmp_path / ("n" * 300))
     assert result.exit_code == 3
     assert "cannot be written (File name too long)" in result.stderr
@@ -165,18 +210,24 @@ def test_what_cannot_be_written_is_found_before_the_work(tmp_path, option):
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
 
 
+def test_pipes_and_links_in_a_ring_are_found_before_the_work(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    done = []
+    made = command(lambda out: done.append(out))
+    for name in ("pipe", "a"):
+        result = run(made, "-o", tmp_path / name, "--force")
+        assert result.exit_code == 3
+        assert f"{tmp_path / name}: cannot be written" in result.stderr
+    assert not done
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_a_command_that_writes_folders_may_replace_one(tmp_path):
     (tmp_path / "set").mkdir()
     made = command(lambda out: None, folder=True)
     assert run(made, "-o", tmp_path / "set", "--force").exit_code == 0
-
-
-@pytest.mark.parametrize("kind", [InputError, NumericalError])
-def test_a_message_gets_its_file_once(kind):
-    with pytest.raises(kind, match=r"^a\.npz: too dark$"), naming("a.npz"):
-        raise kind("too dark")
-    with pytest.raises(kind, match=r"^a\.npz: too dark$"), naming("a.npz"):
-        raise kind("a.npz: too dark")
 
 
 def test_textons_and_synthesize_name_the_file_that_is_too_odd(btfpipe, make_sample, tmp_path):
@@ -206,8 +257,3 @@ def test_the_package_runs_as_a_module():
         [sys.executable, "-m", "btfpipe", "--help"], capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith("Usage: btfpipe ")
-
-
-def test_json_of_a_report_holds_null_for_what_is_no_number(tmp_path):
-    store.write_json(tmp_path / "r.json", {"psnr": float("inf")})
-    assert json.loads((tmp_path / "r.json").read_text()) == {"psnr": None}

@@ -333,9 +333,9 @@ def test_a_black_sample_becomes_a_black_model():
 def test_bad_input_is_refused_by_name(make_sample):
     sample = make_sample(2, 3)
     for terms, message in (
-        ((9, 25), "9 terms over 7 views: more than there are. 4 terms are"),
+        ((9, 25), "9 terms over 7 views: more than there are. Pass --view-harmonics 4, which"),
         ((4, 24), "24 spherical harmonics asked for"),
-        ((4, 25), "25 terms over 19 lights: more than there are. 9 terms are"),
+        ((4, 25), "25 terms over 19 lights: more than there are. Pass --light-harmonics 9, which"),
     ):
         with pytest.raises(InputError, match=message):
             compress_harmonics(sample, *terms)

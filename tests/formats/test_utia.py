@@ -94,6 +94,7 @@ def test_without_the_list_the_nominal_light_is_kept_with_a_warning(tmp_path, mak
     with utia.open_measurement(tmp_path / "set") as measurement:
         assert measurement.facts["coincident_pairs"] == 7
         assert "7 pairs" in measurement.facts["warnings"][0]
+        assert "--directions" in measurement.facts["warnings"][0]
         assert len(measurement.light_directions) == 7
 
 

@@ -182,3 +182,8 @@ def _peak_private_mib(command):
             time.sleep(0.003)
     assert process.returncode == 0
     return peak / 1024
+
+
+def test_memory_below_a_mebibyte_is_not_called_none(scene_file, btfpipe, tmp_path):
+    command = ("render", scene_file([GREY]), "-o", tmp_path / "p.exr", "--memory", "100K")
+    assert "--memory allows 100 KiB: " in btfpipe(*command, code=3).stderr

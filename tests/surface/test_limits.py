@@ -16,12 +16,12 @@ def test_memory_that_does_not_suffice_is_refused_with_the_vertices_that_fit(
     mesh = shapes.obj(tmp_path / "sphere.obj", *shapes.sphere(1))
     ask = ("surface", mesh, "-o", tmp_path / "s.npz", "--levels", 1)
     done = btfpipe(*ask, "--vertices", 20000, "--memory", "202M", code=3)
-    assert "sphere.obj: 20000 vertices need about 228 MB; --memory allows 202 MB" in done.stderr
+    assert "sphere.obj: 20000 vertices need about 229 MB; --memory allows 202 MB" in done.stderr
     fits = int(re.search(r"at most (\d+) with --vertices", done.stderr)[1])
     btfpipe(*ask, "--vertices", fits + 1, "--memory", "202M", code=3)
     btfpipe(*ask, "--vertices", fits, "--memory", "202M")
     done = btfpipe(*ask, "--vertices", 100, "--memory", "100M", "--force", code=3)
-    assert "raise it" in done.stderr
+    assert "Raise it" in done.stderr
 
 
 def test_the_number_of_vertices_has_an_end(shapes, btfpipe, tmp_path):

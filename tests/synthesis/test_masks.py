@@ -229,7 +229,7 @@ def test_the_command_line_lays_valid_texels_alone(btfpipe, half, tmp_path, spher
     half.save(tmp_path / "s.npz")
     sphere_surface.save(tmp_path / "u.npz")
     btfpipe("textons", tmp_path / "s.npz", "--levels", 2, "-k", 6, "-o", tmp_path / "f.npz")
-    assert "invalid_texels: 1024 x 272" in btfpipe("info", tmp_path / "f.npz").stdout
+    assert "invalid texels: 1024 272\n" in btfpipe("info", tmp_path / "f.npz").stdout
     for source in ("f.npz", "s.npz"):
         for target in (["--plane", "32x32"], [tmp_path / "u.npz"]):
             out = tmp_path / "c.npz"

@@ -53,6 +53,7 @@ def code(*parts):
     """Digest of the code that a stage leans on; a change of it makes the stage run again."""
     common = (
         "store.py",
+        "files.py",
         "compiled.py",
         "parallel.py",
         "hashing.py",
