@@ -92,8 +92,9 @@ def export(
         facts = targets.write(
             out, format_, appearance, threads=threads, on_progress=report, **options
         )
+    warn(*facts.get("warnings", []))
     invalid = {"invalid_texels": appearance.n_invalid} if appearance.n_invalid else {}
-    return {"inputs": [source], "format": format_, **taken, **(facts or {}), **invalid}
+    return {"inputs": [source], "format": format_, **taken, **facts, **invalid}
 
 
 def _check_ending(out, format_):

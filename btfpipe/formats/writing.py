@@ -18,6 +18,7 @@ from btfpipe.sample.transfer import encode
 
 _BLOCK_BYTES = 4 << 20  # linear pictures at a time
 _HALF = float(np.finfo(np.float16).max)
+_MUCH = 2.0  # largest value that eight bits take without a word
 CURVES = {".jpg": "gamma2.2", ".png": "srgb"}  # what readers of these sets take without being told
 
 
@@ -159,10 +160,10 @@ class Pictures:
             "texels_per_mm": appearance.texels_per_mm,
         }
         self.facts = {"pictures": len(self.pairs), "white": self.white, "largest": largest}
-        if largest is not None and largest > 1:
+        if largest is not None and largest > _MUCH:
             self.facts["warnings"] = [
-                f"values up to {largest:.3g} are divided by that for 8 bits, whose steps dark ones then see; --suffix .exr keeps"
-                " them as they are"
+                f"values up to {largest:.3g} are divided by that to fit 8 bits, and dark ones lose steps; --suffix .exr keeps them"
+                " as they are"
             ]
 
     def _largest(self):

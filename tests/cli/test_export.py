@@ -40,7 +40,8 @@ def test_what_is_exported_is_ingested_as_it_was(
     bright.absolute = absolute
     bright.save(small)
     target = tmp_path / "set.zip"
-    btfpipe("export", small, "--format", format_, "--suffix", suffix, "-o", target)
+    done = btfpipe("export", small, "--format", format_, "--suffix", suffix, "-o", target)
+    assert ("--suffix .exr keeps them" in done.stderr) == (brightness > 1 and suffix == ".png")
     done = btfpipe("ingest", target, "-o", tmp_path / "back.npz", "--json")
     facts = json.loads(done.stdout)
     assert facts["taken_for"] == taken_for
