@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from btfpipe.compression import shading_needs
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, amount
 from btfpipe.rendering import objects
 from btfpipe.rendering.description import naming_entry
 from btfpipe.rendering.environment import KEPT_PIXEL_BYTES, PIXEL_BYTES
@@ -77,11 +77,11 @@ def plan_threads(parts, tile, threads, memory):
         shares = [(part, part.kept + part.rendering) for part in parts]
         shares.append((Part("a tile of pixels in work", instead="fewer samples a pixel"), tile))
     shares.sort(key=lambda share: -share[1])
-    listed = ", ".join(f"{part.name} {_size(size)}" for part, size in shares if size >= 1 << 20)
+    listed = ", ".join(f"{part.name} {amount(size)}" for part, size in shares if size >= 1 << 20)
     need = sum(size for _, size in shares)
     instead = next(part.instead for part, _ in shares if part is not parts[0])
     raise InputError(
-        f"rendering takes {_size(need)} of memory and --memory allows {_size(memory)}: {listed}. Pass --memory"
+        f"rendering takes {amount(need)} of memory and --memory allows {amount(memory, math.floor)}: {listed}. Pass --memory"
         f" {math.ceil(need / 2**20)}M{instead and ', or take ' + instead}."
     )
 
@@ -204,9 +204,3 @@ def _tile_of(film, slice_bytes, ray_bytes):
     side = tile_side(film.samples, slice_bytes)
     pixels = min(side, film.width) * min(side, film.height)
     return pixels * (film.samples * ray_bytes + _TILE_PIXEL_BYTES)
-
-
-def _size(count):
-    if count < 2**20:
-        return f"{count // 2**10} KiB"
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{math.ceil(count / 2**20)} MiB"

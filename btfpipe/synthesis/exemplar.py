@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from btfpipe.analysis.neighbours import bounding_box, coarse_texel, usable_texels
-from btfpipe.errors import InputError
+from btfpipe.errors import InputError, amount
 from btfpipe.hashing import uniform
 from btfpipe.parallel import single_threaded_blas
 
@@ -121,7 +121,7 @@ def _tables(level, side, toroidal, distance):
         if level.gram is None and len(level.vectors) > 4 * TABLE_LIMIT:
             raise InputError(
                 f"a dot-product matrix of {len(level.vectors)} vectors would take"
-                f" {len(level.vectors) ** 2 * 4 / 2**30:.1f} GiB; leave --distance out, or make textons of them."
+                f" {amount(4 * len(level.vectors) ** 2)}; leave --distance out, or make textons of them."
             )
         table = _square_distances(level)
         return _with_views(side, labels, table, np.zeros((0, 0, 0), np.float32), none)

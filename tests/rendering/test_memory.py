@@ -25,7 +25,7 @@ LAMPS = [
 
 @pytest.fixture
 def refused(btfpipe, tmp_path):
-    """Render with too little memory: the sentence, and the MiB that it asks for."""
+    """Render with too little memory: the sentence, and the MB that it asks for."""
 
     def run(path, memory=1, *args):
         command = ("render", path, "-o", tmp_path / "not.exr", "--memory", f"{memory}M", *args)
@@ -45,8 +45,8 @@ def test_the_refusal_names_the_parts_largest_first_and_a_memory_that_does(
     bind = ("--threads", 1, "--bind", f"model={tmp_path / 'm.sample.npz'}")
     error, need = refused(path, 64, *bind)
     copy = math.ceil(7 * 19 * 160 * 160 * 12 / 2**20)  # views, lights, texels, three numbers
-    assert f"scene.yaml: rendering takes {need} MiB of memory and --memory allows 64 MiB: " in error
-    assert f"the program itself 120 MiB, {tmp_path / 'm.sample.npz'} {copy} MiB, " in error
+    assert f"scene.yaml: rendering takes {need} MB of memory and --memory allows 64 MB: " in error
+    assert f"the program itself 120 MB, {tmp_path / 'm.sample.npz'} {copy} MB, " in error
     assert len(error.splitlines()) == 1
     assert "or take a Model in the sample's place: `btfpipe compress`" in error
     refused(path, need - 1, *bind)
@@ -58,9 +58,9 @@ def test_the_refusal_names_the_parts_largest_first_and_a_memory_that_does(
 def test_a_film_counts_by_its_pixels(scene_file, refused):
     path = scene_file([GREY])
     error, small = refused(path)
-    assert "the film of 64 x 64" not in error  # parts below a MiB are not worth their words
+    assert "the film of 64 x 64" not in error  # parts below a MB are not worth their words
     error, large = refused(path, 1, "--width", 3000, "--height", 2000)
-    assert "the film of 3000 x 2000 pixels 229 MiB" in error  # ten numbers of four bytes
+    assert "the film of 3000 x 2000 pixels 229 MB" in error  # ten numbers of four bytes
     assert "or take a smaller film" in error
     assert large - small > 228
 
@@ -69,7 +69,7 @@ def test_maps_count_one_by_one_while_they_are_made_into_lights(scene_file, refus
     write_picture(tmp_path / "room.exr", np.ones((1024, 2048, 3), np.float32))
     light = {"type": "environment", "map": "room.exr", "visible": False}
     error, one = refused(scene_file([GREY], lights=[light]))
-    assert f"{tmp_path / 'room.exr'} of 2048 x 1024 pixels 420 MiB" in error
+    assert f"{tmp_path / 'room.exr'} of 2048 x 1024 pixels 420 MB" in error
     assert "or take a smaller map" in error
     _, two = refused(scene_file([GREY], lights=[light, light]))
     assert 0 < two - one < 100  # what is kept of the first
@@ -184,6 +184,6 @@ def _peak_private_mib(command):
     return peak / 1024
 
 
-def test_memory_below_a_mebibyte_is_not_called_none(scene_file, btfpipe, tmp_path):
+def test_memory_below_a_megabyte_is_not_called_none(scene_file, btfpipe, tmp_path):
     command = ("render", scene_file([GREY]), "-o", tmp_path / "p.exr", "--memory", "100K")
-    assert "--memory allows 100 KiB: " in btfpipe(*command, code=3).stderr
+    assert "--memory allows 100 KB: " in btfpipe(*command, code=3).stderr
