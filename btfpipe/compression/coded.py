@@ -30,7 +30,7 @@ from btfpipe.compression.model import (
     read_tables,
     tables,
 )
-from btfpipe.compression.svd import SvdModel, factorise
+from btfpipe.compression.svd import SvdModel, factorise, planar_codes, planar_pictures
 from btfpipe.errors import InputError, too_little
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
@@ -252,8 +252,8 @@ def compress_coded(
 
     roots = _Roots(sample)
     texture, angular, facts = factorise(
-        roots, n_terms, measure=False, iterations=1, precision="single", seed=seed, threads=threads,
-        memory=memory, on_progress=first,
+        roots, n_terms, rows=_Roots.rows, measure=False, iterations=1, precision="single", seed=seed,
+        threads=threads, memory=memory, on_progress=first,
     )  # fmt: skip
     with single_threaded_blas():
         packer = _Packer(SvdModel(texture.reshape(*sample.shape, -1), angular, roots, facts))
@@ -290,10 +290,16 @@ class _Roots:
             self.table = np.sqrt(decode_table(np.uint8, source.transfer, source.scale))
 
     def pictures(self, pairs):
-        if self.table is not None:
-            return self.table[np.asarray(self.source.codes[pairs])]
         values = np.asarray(self.source.pictures(pairs), np.float32)
-        return np.copysign(np.sqrt(np.abs(values)), values)
+        roots = np.abs(values)
+        np.sqrt(roots, out=roots)
+        return np.copysign(roots, values, out=roots)
+
+    def rows(self, pairs):
+        """As `planar_pictures`."""
+        if self.table is None:
+            return planar_pictures(self, pairs)
+        return planar_codes(self.source.codes[pairs], self.table)
 
 
 def _principal_axes(values, axis):

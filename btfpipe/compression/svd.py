@@ -445,11 +445,8 @@ def planar_pictures(sample, pairs, lines=slice(None)):
     """
     codes = getattr(sample, "codes", None)
     if codes is not None and codes.dtype == np.uint8 and sample.gain is None:
-        codes = np.ascontiguousarray(codes[pairs, lines])
-        codes = codes.reshape(len(codes), -1, 3)
-        values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
-        decode_planar(codes, decode_table(np.uint8, sample.transfer, sample.scale), values)
-        return values.reshape(3 * len(codes), -1)
+        table = decode_table(np.uint8, sample.transfer, sample.scale)
+        return planar_codes(codes[pairs, lines], table)
     if codes is None:
         values = sample.pictures(pairs)[:, lines]
     else:
@@ -457,6 +454,15 @@ def planar_pictures(sample, pairs, lines=slice(None)):
         if sample.gain is not None:
             values = values * sample.gain[lines]
     return np.ascontiguousarray(values.transpose(0, 3, 1, 2)).reshape(3 * len(values), -1)
+
+
+def planar_codes(codes, table):
+    """Table values of 8-bit codes (pairs, rows, cols, 3) as rows (pairs * 3, texels) float32."""
+    codes = np.ascontiguousarray(codes)
+    codes = codes.reshape(len(codes), -1, 3)
+    values = np.empty((len(codes), 3, codes.shape[1]), np.float32)
+    decode_planar(codes, table, values)
+    return values.reshape(3 * len(codes), -1)
 
 
 @njit(cache=True, nogil=True)
