@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from shared_memory import peak_private_mb
 
 from btfpipe.compression.local_pca import compress_local_pca
 from btfpipe.compression.view_pca import compress_view_pca
@@ -127,7 +128,7 @@ def test_private_memory(benchmark, tmp_path):
     for module in ("view_pca", "local_pca"):
         code = _MEMORY.format(module=module, function=f"compress_{module}")
         command = [sys.executable, "-c", code, str(path), str(tmp_path / "m.npz")]
-        peak, took = seconds(svd_bench.peak_private_mb, command)
+        peak, took = seconds(peak_private_mb, command)
         benchmark.extra_info[module] = {"peak_private_mb": peak, "seconds": took}
         svd_bench.say(f"{module}, 256 x 256 x 6561: peak private {peak:.0f} MB, {took:.1f} s")
         assert peak < 2048

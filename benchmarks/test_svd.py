@@ -5,11 +5,11 @@ error of about 8 %), as 8-bit codes. `svds` gets the linear values as one float3
 """
 
 import math
-import subprocess
 import sys
 import time
 
 import numpy as np
+from shared_memory import peak_private_mb
 
 from btfpipe import store
 from btfpipe.compression.svd import compress_svd
@@ -73,22 +73,6 @@ def linear_matrix(sample):
             len(out), -1
         )
     return out
-
-
-def peak_private_mb(command):
-    """Run a command; the largest RssAnon seen while it ran, in MB."""
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-        peak = 0
-        while process.poll() is None:
-            try:
-                with open(f"/proc/{process.pid}/status") as status:
-                    found = [line for line in status if line.startswith("RssAnon")]
-            except OSError:
-                break
-            peak = max([peak, *(int(line.split()[1]) for line in found)])
-            time.sleep(0.005)
-    assert process.returncode == 0
-    return peak / 1024
 
 
 def test_svd_is_many_times_faster_than_svds(benchmark, tmp_path):

@@ -150,9 +150,8 @@ def ingest(source, format_, out, threads, quiet, **options):
     if "transfer" in takes:
         own["transfer"] = options.pop("transfer")
     own = {key: value for key, value in own.items() if value not in (None, False)}
-    cosine = (
-        None if "cosine" in takes else own.pop("cosine", None)
-    )  # pictures of any format may say
+    # pictures of any format may say
+    cosine = None if "cosine" in takes else own.pop("cosine", None)
     frontal = options.pop("frontal")
     if frontal and "pairs" in takes:
         own["pairs"] = True  # one pair is a product, whatever the set lacks

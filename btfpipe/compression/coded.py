@@ -46,10 +46,7 @@ _LEAST = 16 << 10  # bytes of factors that the default ratio leaves to tiny samp
 _CLOSE = 0.01  # share of the wanted size by which a file may be smaller
 _MOST_TRIALS = 24
 _SEARCH = 1.25  # of the reading of all pictures, what the search for the step takes, as measured
-_TRANSFORMED, _PACKED = (
-    0.3,
-    0.85,
-)  # shares of the search that end with the transforms and with the last trial
+_TRANSFORMED, _PACKED = 0.3, 0.85  # shares of the search that end with transforms, and with trials
 _TRIED = 5  # times the wanted size is what trials make in all, about
 _TEXELS = 1 << 11  # whose factors stay in the processor's cache for all colours
 _BLOCK = 1 << 14  # rows a matrix product, fixed

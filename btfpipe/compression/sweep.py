@@ -63,9 +63,8 @@ def sweep(sample, settings=None, *, seed=0, threads=1, memory=2 << 30, on_progre
                 row["skipped"] = str(error)
             else:
                 row["seconds"] = round(time.perf_counter() - start, 3)
-                warnings = model.about.pop(
-                    "warnings", []
-                )  # no part of a file, as `compress` writes it
+                # no part of a file, as `compress` writes it
+                warnings = model.about.pop("warnings", [])
                 model.save(path)
                 size = path.stat().st_size
                 figures = compare(model, sample, threads=threads).overall()

@@ -36,9 +36,8 @@ def write(path, name, appearance, *, threads=1, on_progress=None, **options):
     if isinstance(facts, dict):
         return facts
     model = facts  # that a .btf holds
-    told = (
-        () if model is appearance else ("rmse", "relative_error", "warnings")
-    )  # of what was left out on the way
+    # of what was left out on the way
+    told = () if model is appearance else ("rmse", "relative_error", "warnings")
     return {
         "method": model.method,
         "terms": list(model.n_terms),

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from btfpipe.description import read_description
 from btfpipe.errors import InputError
+from btfpipe.surface.surface import EXTENTS
 
-_LARGEST = 1e15  # of a coordinate; meshes reach no farther
+_LARGEST = EXTENTS[1]  # of a coordinate; meshes reach no farther
 _FORM = "strokes: [{point: [x, y, z], vector: [x, y, z]}, ...]"
 
 

@@ -7,16 +7,15 @@ import numpy as np
 from btfpipe import store
 from btfpipe.errors import InputError
 
-_EXTENTS = (1e-15, 1e15)  # of a mesh, whose squares and their reciprocals are in single precision
+EXTENTS = (1e-15, 1e15)  # of a mesh, whose squares and their reciprocals are in single precision
 _UNIT = 1e-3  # by how much the length of a normal or tangent may be off
-_MOST_WEIGHT = (
-    1e3  # of a corner of the triangle that a vertex lies in, which may be a little outside
-)
+# of a corner of the triangle that a vertex lies in, which may be a little outside
+_MOST_WEIGHT = 1e3
 
 
 def require_extent(vertices, name):
     """Refuse a mesh (n, 3) whose lengths, or places, are beyond what later stages multiply in single precision."""
-    low, high = _EXTENTS
+    low, high = EXTENTS
     reach = float(np.abs(vertices).max(initial=0))
     extent = float(np.ptp(vertices, axis=0).max()) if reach < high and len(vertices) else 0.0
     if not low < extent <= reach * 2 < 2 * high:

@@ -3,12 +3,11 @@
 import math
 import os
 import re
-import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
+from shared_memory import peak_private_mb
 
 from btfpipe.compression import compress, shading_needs
 from btfpipe.formats.images import write_picture
@@ -164,24 +163,8 @@ def test_a_render_stays_within_the_memory_that_it_is_given(
     need = refused(path)[1]
     command = ["render", path, "-o", tmp_path / "p.exr", "--memory", f"{need}M", "-t", 2, "-q"]
     btfpipe(*command, "--width", 32, "--height", 24)  # compiles what is not yet compiled
-    peak = _peak_private_mib([sys.executable, "-m", "btfpipe", *map(str, command), "--force"])
+    peak = peak_private_mb([sys.executable, "-m", "btfpipe", *map(str, command), "--force"])
     assert need / 2 < peak <= need
-
-
-def _peak_private_mib(command):
-    """Run a command; the largest RssAnon seen while it ran."""
-    peak = 0
-    with subprocess.Popen(command) as process:
-        while process.poll() is None:
-            try:
-                with open(f"/proc/{process.pid}/status") as status:
-                    found = [line for line in status if line.startswith("RssAnon")]
-            except OSError:
-                break
-            peak = max([peak, *(int(line.split()[1]) for line in found)])
-            time.sleep(0.003)
-    assert process.returncode == 0
-    return peak / 1024
 
 
 def test_memory_below_a_megabyte_is_not_called_none(scene_file, btfpipe, tmp_path):
