@@ -6,14 +6,18 @@ or -1 on a boundary. ``leave[v]`` is a half-edge that leaves vertex v, the bound
 boundary, so that turning counter-clockwise from it meets every face of v. Dead faces have
 ``corner[3 f] = -1``, dead vertices ``leave[v] = -1``.
 
-``feature`` marks the half-edges of boundaries and creases; ``kind`` says whether a vertex moves freely (0), along its two
-feature edges (1), or not at all (2). All three edits keep the mesh a manifold of the same genus.
+``feature`` is 0, or 1 + the number of a feature edge of the input that the half-edge runs along; ``kind`` says whether a
+vertex moves freely (0), along its two feature edges (1), or not at all (2). ``place`` is a face of the input at or near a
+vertex, ``along`` a feature edge of the input at or near a vertex of kind 1: walks start there (`projection`). ``origin`` is
+the face of the input that a face lies in, or -1 where it is not known any more. All three edits keep the mesh a manifold of
+the same genus.
 """
 
 import numpy as np
 from numba import njit, prange
 
 _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
+_STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
 _RING = 96  # vertices of more neighbours than this are left alone
 
 
@@ -32,10 +36,10 @@ def _join(opposite, feature, h, g, mark):
     """Make h and g the two sides of one edge; either may be -1."""
     if h >= 0:
         opposite[h] = g
-        feature[h] = 1 if g < 0 else mark
+        feature[h] = mark
     if g >= 0:
         opposite[g] = h
-        feature[g] = 1 if h < 0 else mark
+        feature[g] = mark
 
 
 @njit(cache=True, nogil=True)
@@ -104,8 +108,26 @@ def _longest_beside(corner, opposite, points, h):
 
 
 @njit(cache=True, nogil=True)
-def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces, longest):
+def _area2(points, corner, h):
+    """The square of twice the area of the face at h."""
+    a, b, c = corner[h], corner[_next(h)], corner[_previous(h)]
+    x, y, z = _cross(
+        points[a, 0], points[a, 1], points[a, 2],
+        points[b, 0], points[b, 1], points[b, 2],
+        points[c, 0], points[c, 1], points[c, 2],
+    )  # fmt: skip
+    return x * x + y * y + z * z
+
+
+@njit(cache=True, nogil=True)
+def split_long(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces, longest, thin,
+):  # fmt: skip
     """Halve edges longer than `longest`, repeatedly, each when it is the longest of its faces.
+
+    With `thin` above 0, edges along features are halved whatever lies beside them, and others only between faces
+    that are higher than that.
 
     Stops early when the arrays are full. Returns the new numbers of vertices and faces and
     whether it finished.
@@ -121,21 +143,34 @@ def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices,
                 continue
             a, b = corner[h], corner[_next(h)]
             length = _length2(points, a, b)
-            if length <= limit or length < _longest_beside(corner, opposite, points, h):
+            if length <= limit:
+                continue
+            free = thin > 0.0 and feature[h] > 0
+            if not free and length < _longest_beside(corner, opposite, points, h):
                 continue
             if n_vertices + 1 > len(points) or 3 * (n_faces + 2) > len(corner):
                 return n_vertices, n_faces, False
-            changed = True
             g = opposite[h]
             mark = feature[h]
+            if mark == 0 and thin > 0.0:
+                low = min(_area2(points, corner, h), _area2(points, corner, g))
+                if low < thin * thin * length:
+                    continue
+            changed = True
             m = n_vertices
             n_vertices += 1
             for axis in range(3):
                 points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
                 flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
             kind[m] = 1 if mark else 0
+            along[m] = mark - 1
+            if mark and origin[h // 3] < 0:
+                # nearer than where the whole edge once was
+                along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
+            place[m] = origin[h // 3] if origin[h // 3] >= 0 else place[a]
             # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
             f = 3 * n_faces
+            origin[n_faces] = origin[h // 3]
             n_faces += 1
             h1 = _next(h)
             c = corner[_previous(h)]
@@ -145,12 +180,13 @@ def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices,
             _join(opposite, feature, f + 1, outer, outer_mark)
             _join(opposite, feature, f + 2, h1, 0)
             if g < 0:
-                _join(opposite, feature, f, -1, 1)
-                _join(opposite, feature, h, -1, 1)
+                _join(opposite, feature, f, -1, mark)
+                _join(opposite, feature, h, -1, mark)
                 leave[m] = f
             else:
                 # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
                 e = 3 * n_faces
+                origin[n_faces] = origin[g // 3]
                 n_faces += 1
                 g1 = _next(g)
                 d = corner[_previous(g)]
@@ -170,8 +206,8 @@ def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices,
 
 
 @njit(cache=True, nogil=True)
-def _folds(corner, points, out, n, skip1, skip2, x, y, z):
-    """Whether moving the vertex that the half-edges `out` leave to (x, y, z) turns a face over."""
+def _folds(corner, points, out, n, skip1, skip2, x, y, z, least):
+    """Whether moving the vertex that the half-edges `out` leave to (x, y, z) turns a face's normal so that the cosine is below `least`."""
     for i in range(n):
         h = out[i]
         if h // 3 == skip1 or h // 3 == skip2:
@@ -189,17 +225,19 @@ def _folds(corner, points, out, n, skip1, skip2, x, y, z):
         )  # fmt: skip
         old = np.sqrt(ox * ox + oy * oy + oz * oz)
         new = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if ox * nx + oy * ny + oz * nz < 0.2 * old * new:
+        if ox * nx + oy * ny + oz * nz < least * old * new:
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
 def collapse_short(
-    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest
-):
+    corner, opposite, feature, leave, kind, origin, points, flat, n_faces,
+    shortest, longest, least,
+):  # fmt: skip
     """Collapse edges shorter than `shortest` where nothing folds, tears or gets longer than `longest`.
 
+    A fold is a normal that turns so that its cosine is below `least`.
     Returns the number of collapses. Features are shortened only along themselves, and a component
     or a hole never vanishes (link condition).
     """
@@ -260,26 +298,29 @@ def collapse_short(
             stretched = False
             for i in range(n_a + n_b if both else n_a):
                 v = near_a[i] if i < n_a else near_b[i - n_a]
-                if (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (
-                    points[v, 2] - z
-                ) ** 2 > bound:
+                now = (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2
+                if now > bound and now > _STRETCH * _length2(points, v, a if i < n_a else b):
                     stretched = True
                     break
             f0 = h // 3
             f1 = g // 3 if g >= 0 else -1
-            if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z):
+            if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z, least):
                 continue
-            if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z):
+            if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z, least):
                 continue
             points[b, 0], points[b, 1], points[b, 2] = x, y, z
             for axis in range(3):
                 flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
             c = corner[h2]
             d = corner[_previous(g)] if g >= 0 else -1
-            mark = feature[h1] | feature[h2]
-            inner_mark = feature[_next(g)] | feature[_previous(g)] if g >= 0 else 0
+            mark = max(feature[h1], feature[h2])
+            inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
             for i in range(faces_a):
                 corner[out_a[i]] = b
+                origin[out_a[i] // 3] = -1
+            if both:
+                for i in range(faces_b):
+                    origin[out_b[i] // 3] = -1
             corner[3 * f0] = -1
             _join(opposite, feature, outer1, outer2, mark)
             if g >= 0:
@@ -324,7 +365,7 @@ def _excess(corner, opposite, n_faces, n_vertices):
 
 
 @njit(cache=True, nogil=True)
-def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
+def flip_edges(corner, opposite, feature, leave, origin, points, n_faces, by_degree):
     """Flip edges towards even degrees (`by_degree`) or towards Delaunay triangles; returns the number of flips."""
     done = 0
     excess = _excess(corner, opposite, n_faces, len(leave))
@@ -368,6 +409,8 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         o_ad, m_ad = opposite[g1], feature[g1]
         o_db, m_db = opposite[g2], feature[g2]
         i, j = h - h % 3, g - g % 3
+        if origin[i // 3] != origin[j // 3]:
+            origin[i // 3] = origin[j // 3] = -1
         corner[i], corner[i + 1], corner[i + 2] = a, d, c
         corner[j], corner[j + 1], corner[j + 2] = d, b, c
         _join(opposite, feature, i, o_ad, m_ad)
@@ -480,7 +523,10 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
 
 
 @njit(cache=True, nogil=True)
-def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces):
+def compact(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces,
+):  # fmt: skip
     """Move the living to the front, in order; returns their numbers."""
     renamed = np.empty(n_vertices, np.int64)
     n = 0
@@ -488,6 +534,7 @@ def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_
         renamed[v] = n
         if leave[v] >= 0:
             leave[n], kind[n] = leave[v], kind[v]
+            place[n], along[n] = place[v], along[v]
             for axis in range(3):
                 points[n, axis] = points[v, axis]
                 flat[n, axis] = flat[v, axis]
@@ -500,6 +547,7 @@ def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_
     for f in range(n_faces):
         if corner[3 * f] < 0:
             continue
+        origin[moved[f]] = origin[f]
         for k in range(3):
             h, g = 3 * f + k, 3 * moved[f] + k
             corner[g] = renamed[corner[h]]

@@ -9,101 +9,143 @@ import numpy as np
 
 from btfpipe.errors import InputError
 from btfpipe.surface import _edges
-from btfpipe.surface.topology import edge_keys, half_edges, opposite_half_edges
+from btfpipe.surface.feature_lines import feature_lines
+from btfpipe.surface.projection import walk_faces, walk_lines
+from btfpipe.surface.topology import half_edges, mesh_area
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
 _MORE_ROUNDS = 6
+_HELD = 0.3  # spacings that a corner of the input may lie off
 _MOST_GROWTH = 16  # times the vertices wanted and given; sound meshes stay below twice
 
 
 class _Mesh:
     """The tables that the compiled edits work on, with room to grow."""
 
-    def __init__(self, source, most):
-        self.most = most
+    def __init__(self, source, lines):
+        self.source, self.lines = source, lines
         n, m = len(source.vertices), len(source.faces)
         self.n_vertices, self.n_faces = n, m
-        opposite = opposite_half_edges(source.faces)
-        feature = np.isin(edge_keys(source.faces), _keys(source.features, source.faces))
         start, _ = half_edges(source.faces)
-        leave = np.empty(n, np.int32)
         half = np.arange(3 * m)
+        rim = source.opposite < 0
+        leave, place = np.empty(n, np.int32), np.empty(n, np.int32)
         leave[start] = half
-        rim = opposite < 0
         leave[start[rim]] = half[rim]
+        place[start] = half // 3
+        along = np.full(n, -1, np.int32)
+        along[lines.ends.ravel()] = np.arange(len(lines.ends)).repeat(2)
         self.corner = source.faces.ravel().astype(np.int32)
-        self.opposite = opposite
-        self.feature = (feature | rim).astype(np.uint8)
-        self.leave, self.kind = leave, source.kind.copy()
+        self.opposite, self.feature = source.opposite.copy(), np.zeros(3 * m, np.int32)
+        self._mark(lines.half, 1 + np.arange(len(lines.half)))
+        self.origin = np.arange(m, dtype=np.int32)
+        self.leave, self.kind, self.place, self.along = leave, lines.kind.copy(), place, along
         self.points, self.flat = source.vertices.copy(), source.vertices.copy()
 
+    def _mark(self, half, numbers):
+        """Set the numbers of feature edges, on both sides of each."""
+        self.feature[half] = numbers
+        other = self.opposite[half]
+        self.feature[other[other >= 0]] = numbers[other >= 0]
+
+    def cut(self, target):
+        """Cut the faces of the input down to edges of about `target`, without leaving the faces.
+
+        From the longest edges down, so that faces stay in shape. All edges of the input count as features on the way: what flips lies within a face, and a long thin face is cut along
+        its long edges only.
+        """
+        n = self.n_vertices
+        start, end = half_edges(self.faces())
+        longest = np.linalg.norm(self.points[start] - self.points[end], axis=1).max()
+        halvings = int(np.ceil(np.log2(longest / target)))
+        if halvings <= 0:
+            return
+        once = np.flatnonzero(np.arange(len(self.opposite)) > self.opposite)
+        number = np.zeros(1 + len(once), np.int32)  # of the feature lines among all edges
+        number[1:] = self.feature[once]
+        self._mark(once, 1 + np.arange(len(once), dtype=np.int32))
+        for i in range(halvings, -1, -1):
+            self.split(_TOO_LONG * target * 2.0**i, _TOO_SHORT * target)
+            self.flip(False)
+        made = slice(n, self.n_vertices)
+        line = number[1 + self.along[made]]
+        self.kind[made], self.along[made] = line > 0, line - 1
+        self.feature[: 3 * self.n_faces] = number[self.feature[: 3 * self.n_faces]]
+        self.origin[:] = -1
+
     def _grow(self):
-        if len(self.points) > self.most:
-            raise InputError(
-                f"edges are split without end (over {self.most} vertices): a corner sticks out far beyond its surroundings."
-                " Mend the mesh, or try without smoothing."
-            )
-        for name in ("corner", "opposite", "feature", "leave", "kind", "points", "flat"):
+        for name in (
+            "corner", "opposite", "feature", "origin", "leave", "kind", "place", "along", "points", "flat",
+        ):  # fmt: skip
             array = getattr(self, name)
             setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
 
     def _tables(self):
         return self.corner, self.opposite, self.feature, self.leave
 
-    def split(self, longest):
+    def split(self, longest, thin=0.0):
         done = False
         while not done:
             self.n_vertices, self.n_faces, done = _edges.split_long(
-                *self._tables(), self.kind, self.points, self.flat,
-                self.n_vertices, self.n_faces, longest,
+                *self._tables(), self.kind, self.place, self.along, self.origin,
+                self.points, self.flat, self.n_vertices, self.n_faces, longest, thin,
             )  # fmt: skip
             if not done:
                 self._grow()
 
-    def collapse(self, shortest, longest):
+    def collapse(self, shortest, longest, least=0.2):
         count = _edges.collapse_short(
-            *self._tables(), self.kind, self.points, self.flat, self.n_faces, shortest, longest
-        )
+            *self._tables(), self.kind, self.origin, self.points, self.flat, self.n_faces,
+            shortest, longest, least,
+        )  # fmt: skip
         self.n_vertices, self.n_faces = _edges.compact(
-            *self._tables(), self.kind, self.points, self.flat, self.n_vertices, self.n_faces
-        )
+            *self._tables(), self.kind, self.place, self.along, self.origin, self.points, self.flat,
+            self.n_vertices, self.n_faces,
+        )  # fmt: skip
         return count
 
     def flip(self, by_degree):
-        return _edges.flip_edges(*self._tables(), self.points, self.n_faces, by_degree)
+        return _edges.flip_edges(
+            *self._tables(), self.origin, self.points, self.n_faces, by_degree
+        )
 
-    def smooth(self, source, reach):
+    def smooth(self, reach):
         """Move vertices within the surface; returns the face and weights of each on the input."""
-        n = self.n_vertices
-        step = np.zeros((n, 3))
-        _edges.relax(*self._tables(), self.kind, self.points, n, step)
-        return self.place(source, step, reach)
+        step = np.zeros((self.n_vertices, 3))
+        _edges.relax(*self._tables(), self.kind, self.points, self.n_vertices, step)
+        return self.settle(step, reach)
 
-    def place(self, source, step, reach):
+    def settle(self, step, reach):
         """Bring flat positions plus `step` back to the input and lift them onto the smooth surface.
 
-        A vertex that would jump (to the other side of a thin wall) stays where it was.
+        A vertex that would jump stays where it was.
         """
-        n = self.n_vertices
+        n, source, lines = self.n_vertices, self.source, self.lines
         wanted = self.flat[:n] + step
-        face, weights, nearest = source.closest(wanted)
-        bound = np.flatnonzero(self.kind[:n] > 0)
+        place = self.place[:n].copy()
+        weights, nearest = np.empty((n, 3)), np.empty((n, 3))
+        surface = source.vertices, source.faces, source.opposite
+        walk_faces(*surface, wanted, place, weights, nearest)
+        jump = np.flatnonzero(np.linalg.norm(nearest - wanted, axis=1) > reach)
+        if len(jump):
+            back, w, x = self.place[jump], np.empty((len(jump), 3)), np.empty((len(jump), 3))
+            walk_faces(*surface, self.flat[jump], back, w, x)
+            place[jump], weights[jump], nearest[jump] = back, w, x
+        bound = np.flatnonzero(self.kind[:n] == 1)
         if len(bound):
-            on = source.closest_on_features(wanted[bound])
-            face[bound], weights[bound], nearest[bound] = on
-        jump = np.linalg.norm(nearest - wanted, axis=1) > reach
-        if jump.any() and step.any():
-            back = np.flatnonzero(jump & (self.kind[:n] == 0))
-            if len(back):
-                face[back], weights[back], nearest[back] = source.closest(self.flat[back])
-        self.flat[:n] = nearest
-        self.points[:n] = source.lift(face, weights)
-        return face, weights
+            edge, part, x = self.along[bound], np.empty(len(bound)), np.empty((len(bound), 3))
+            walk_lines(source.vertices, lines.ends, lines.after, wanted[bound], edge, part, x)
+            half, rows = lines.half[edge], np.arange(len(bound))
+            w = np.zeros((len(bound), 3))
+            w[rows, half % 3], w[rows, (half + 1) % 3] = 1 - part, part
+            self.along[bound] = edge
+            place[bound], weights[bound], nearest[bound] = half // 3, w, x
+        self.place[:n], self.flat[:n] = place, nearest
+        self.points[:n] = source.lift(place, weights)
+        return place.copy(), weights
 
-
-def _keys(pairs, faces):
-    base = int(faces.max(initial=0)) + 1
-    return pairs.min(axis=1) * base + pairs.max(axis=1)
+    def faces(self):
+        return self.corner[: 3 * self.n_faces].reshape(-1, 3)
 
 
 def resample(source, n_vertices, report=lambda done, total: None, polish=5, settle=6):
@@ -130,48 +172,76 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
     InputError
         If splitting edges does not shorten them.
     """
-    mesh = _Mesh(source, _MOST_GROWTH * (n_vertices + len(source.vertices)))
-    area = (
-        0.5
-        * np.linalg.norm(
-            np.cross(
-                source.vertices[source.faces[:, 1]] - source.vertices[source.faces[:, 0]],
-                source.vertices[source.faces[:, 2]] - source.vertices[source.faces[:, 0]],
-            ),
-            axis=1,
-        ).sum()
-    )
     # an even mesh has 2 faces a vertex, each of area sqrt(3)/4 times the squared edge
-    target = np.sqrt(area / n_vertices * 2 / np.sqrt(3))
-    mesh.place(source, np.zeros((mesh.n_vertices, 3)), np.inf)
-    start, end = half_edges(source.faces)
-    longest = np.linalg.norm(source.vertices[end] - source.vertices[start], axis=1).max()
-    halvings = max(0, int(np.ceil(np.log2(longest / (2 * target)))))
-    rounds = halvings + polish + settle
-    for i in range(halvings):
-        _round(mesh, source, target * 2.0 ** (halvings - i))
-        report(i, rounds)
+    target = np.sqrt(mesh_area(source.vertices, source.faces) / n_vertices * 2 / np.sqrt(3))
+    lines = feature_lines(source.vertices, source.faces, source.opposite, source.crease, target)
+    mesh = _Mesh(source, lines)
+    mesh.cut(target)
+    tips = _Tips(source)
+    rounds = polish + settle
     for i in range(polish + _MORE_ROUNDS):
-        _round(mesh, source, target)
+        _round(mesh, target)
+        if i % 2:
+            tips.hold(mesh, _HELD * target, target)
         off = mesh.n_vertices / n_vertices
         if i + 1 >= polish and abs(off - 1) < 0.02:
             break
         # aim at the wanted number; edges between too short and too long stay, so aim beyond
         target *= np.clip(off, 0.8, 1.25)
-        report(halvings + min(i, polish), rounds)
+        report(min(i, polish), rounds)
     for i in range(settle):
-        face, weights = mesh.smooth(source, 0.5 * target)
+        face, weights = mesh.smooth(0.5 * target)
         mesh.flip(i < settle // 2)
-        report(halvings + polish + i, rounds)
-    n, m = mesh.n_vertices, mesh.n_faces
-    return _in_order(mesh.corner[: 3 * m].reshape(m, 3), mesh.points[:n], face, weights)
+        report(polish + i, rounds)
+    points = mesh.points[: mesh.n_vertices]
+    return _in_order(mesh.faces(), points, face, weights)
 
 
-def _round(mesh, source, length):
+class _Tips:
+    """Corners of the input that a resampling must not cut off."""
+
+    def __init__(self, source):
+        self.source = source
+        start, _ = half_edges(source.faces)
+        self.face = np.empty(len(source.vertices), np.int32)
+        self.face[start] = np.arange(len(start)) // 3
+
+    def hold(self, mesh, bound, spacing):
+        """Move a free vertex to each vertex of the input that lies farther from the mesh than `bound`, and pin it."""
+        import igl
+        from scipy.spatial import cKDTree
+
+        flat, faces = mesh.flat[: mesh.n_vertices], mesh.faces()
+        squared, nearest, _ = igl.point_mesh_squared_distance(
+            self.source.vertices, np.ascontiguousarray(flat), faces.astype(np.int64)
+        )
+        lost = np.flatnonzero(squared > bound**2)
+        if not len(lost):
+            return 0
+        lost = lost[np.argsort(-squared[lost], kind="stable")]
+        tree = cKDTree(self.source.vertices[lost])
+        taken = np.zeros(len(lost), bool)
+        done = 0
+        for i, v in enumerate(lost):
+            if taken[i]:
+                continue
+            taken[tree.query_ball_point(self.source.vertices[v], 0.7 * spacing)] = True
+            corners = faces[nearest[v]]
+            free = corners[mesh.kind[corners] == 0]
+            if len(free):
+                gap = np.linalg.norm(flat[free] - self.source.vertices[v], axis=1)
+                c = free[gap.argmin()]
+                mesh.flat[c] = mesh.points[c] = self.source.vertices[v]
+                mesh.kind[c], mesh.place[c] = 2, self.face[v]
+                done += 1
+        return done
+
+
+def _round(mesh, length):
     mesh.split(_TOO_LONG * length)
     mesh.collapse(_TOO_SHORT * length, _TOO_LONG * length)
     mesh.flip(True)
-    mesh.smooth(source, 0.5 * length)
+    mesh.smooth(0.5 * length)
     mesh.flip(False)
 
 

@@ -48,6 +48,13 @@ def edge_normals_angle(vertices, faces, opposite):
     return np.where(opposite < 0, 0.0, angle)
 
 
+def mesh_area(vertices, faces):
+    """Area of all faces together."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(0.5 * np.linalg.norm(across, axis=1).sum())
+
+
 def face_components(faces, n_vertices):
     """Number of connected components and the component of each vertex, (n_vertices,) int32."""
     from scipy.sparse import coo_matrix
