@@ -8,15 +8,17 @@ boundary, so that turning counter-clockwise from it meets every face of v. Dead 
 
 ``feature`` is 0, or 1 + the number of a feature edge of the input that the half-edge runs along; ``kind`` says whether a
 vertex moves freely (0), along its two feature edges (1), or not at all (2). ``place`` is a face of the input at or near a
-vertex, ``along`` a feature edge of the input at or near a vertex of kind 1: walks start there (`projection`). ``origin`` is
-the face of the input that a face lies in, or -1 where it is not known any more. All three edits keep the mesh a manifold of
-the same genus.
+vertex, ``along`` a feature edge of the input at or near a vertex of kind 1, ``origin`` a face of the input at or near a face,
+on the same side of all feature lines: walks start there (`projection`). All three edits keep the mesh a manifold of the same
+genus.
 """
 
 import numpy as np
 from numba import njit, prange
 
 _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
+_FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge
+_TURNED = 0.5  # cosine of the turn of a normal that makes a fold
 _STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
 _RING = 96  # vertices of more neighbours than this are left alone
 
@@ -164,10 +166,10 @@ def split_long(
                 flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
             kind[m] = 1 if mark else 0
             along[m] = mark - 1
-            if mark and origin[h // 3] < 0:
+            if mark and thin == 0.0:
                 # nearer than where the whole edge once was
                 along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
-            place[m] = origin[h // 3] if origin[h // 3] >= 0 else place[a]
+            place[m] = origin[h // 3]
             # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
             f = 3 * n_faces
             origin[n_faces] = origin[h // 3]
@@ -232,9 +234,8 @@ def _folds(corner, points, out, n, skip1, skip2, x, y, z, least):
 
 @njit(cache=True, nogil=True)
 def collapse_short(
-    corner, opposite, feature, leave, kind, origin, points, flat, n_faces,
-    shortest, longest, least,
-):  # fmt: skip
+    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest, least
+):
     """Collapse edges shorter than `shortest` where nothing folds, tears or gets longer than `longest`.
 
     A fold is a normal that turns so that its cosine is below `least`.
@@ -317,10 +318,6 @@ def collapse_short(
             inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
             for i in range(faces_a):
                 corner[out_a[i]] = b
-                origin[out_a[i] // 3] = -1
-            if both:
-                for i in range(faces_b):
-                    origin[out_b[i] // 3] = -1
             corner[3 * f0] = -1
             _join(opposite, feature, outer1, outer2, mark)
             if g >= 0:
@@ -365,7 +362,7 @@ def _excess(corner, opposite, n_faces, n_vertices):
 
 
 @njit(cache=True, nogil=True)
-def flip_edges(corner, opposite, feature, leave, origin, points, n_faces, by_degree):
+def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
     """Flip edges towards even degrees (`by_degree`) or towards Delaunay triangles; returns the number of flips."""
     done = 0
     excess = _excess(corner, opposite, n_faces, len(leave))
@@ -404,13 +401,14 @@ def flip_edges(corner, opposite, feature, leave, origin, points, n_faces, by_deg
             ux * ux + uy * uy + uz * uz
         ) or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz):
             continue
+        bent = _cosine(px, py, pz, qx, qy, qz)
+        if bent < _FLAT and _cosine(ux, uy, uz, vx, vy, vz) < bent:
+            continue
         o_bc, m_bc = opposite[h1], feature[h1]
         o_ca, m_ca = opposite[h2], feature[h2]
         o_ad, m_ad = opposite[g1], feature[g1]
         o_db, m_db = opposite[g2], feature[g2]
         i, j = h - h % 3, g - g % 3
-        if origin[i // 3] != origin[j // 3]:
-            origin[i // 3] = origin[j // 3] = -1
         corner[i], corner[i + 1], corner[i + 2] = a, d, c
         corner[j], corner[j + 1], corner[j + 2] = d, b, c
         _join(opposite, feature, i, o_ad, m_ad)
@@ -428,6 +426,75 @@ def flip_edges(corner, opposite, feature, leave, origin, points, n_faces, by_deg
         excess[d] += 1
         done += 1
     return done
+
+
+@njit(cache=True, nogil=True)
+def name_origins(corner, n_faces, kind, place, origin):
+    """Set the origin of each face to the place of one of its free vertices, if it has one."""
+    for f in range(n_faces):
+        for k in range(3):
+            v = corner[3 * f + k]
+            if kind[v] == 0:
+                origin[f] = place[v]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cosine(px, py, pz, qx, qy, qz):
+    """Cosine of the angle between two vectors, 1 if one is zero."""
+    size = np.sqrt((px * px + py * py + pz * pz) * (qx * qx + qy * qy + qz * qz))
+    return (px * qx + py * qy + pz * qz) / size if size > 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def folded(corner, n_faces, points, place, moved, moved_place, normals, keep):
+    """Mark the vertices of faces that a move of all vertices turns over; returns whether there are any.
+
+    A face is turned over if its normal turns by more than 60 degrees and then agrees less than
+    before with the normals of the input where its corners lie.
+
+    Parameters
+    ----------
+    corner : (3 m,) int32
+    n_faces : int
+    points, moved : (n, 3) float64
+        Before and after the move.
+    place, moved_place : (n,) int32
+        Faces of the input, before and after.
+    normals : (faces of the input, 3) float64
+    keep : (n,) uint8
+        Set to 1 for what should stay.
+    """
+    found = False
+    for f in range(n_faces):
+        a, b, c = corner[3 * f], corner[3 * f + 1], corner[3 * f + 2]
+        ox, oy, oz = _cross(
+            points[a, 0], points[a, 1], points[a, 2],
+            points[b, 0], points[b, 1], points[b, 2],
+            points[c, 0], points[c, 1], points[c, 2],
+        )  # fmt: skip
+        nx, ny, nz = _cross(
+            moved[a, 0], moved[a, 1], moved[a, 2],
+            moved[b, 0], moved[b, 1], moved[b, 2],
+            moved[c, 0], moved[c, 1], moved[c, 2],
+        )  # fmt: skip
+        if _cosine(ox, oy, oz, nx, ny, nz) >= _TURNED:
+            continue
+        before = _agreement(normals, place[a], place[b], place[c], ox, oy, oz)
+        if _agreement(normals, moved_place[a], moved_place[b], moved_place[c], nx, ny, nz) < before:
+            found = True
+            keep[a] = keep[b] = keep[c] = 1
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _agreement(normals, i, j, k, x, y, z):
+    """Cosine of the angle between a vector and the sum of three normals."""
+    return _cosine(
+        normals[i, 0] + normals[j, 0] + normals[k, 0],
+        normals[i, 1] + normals[j, 1] + normals[k, 1],
+        normals[i, 2] + normals[j, 2] + normals[k, 2],
+        x, y, z,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

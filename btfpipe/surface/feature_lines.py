@@ -7,7 +7,10 @@ import numpy as np
 from btfpipe.surface.topology import edge_normals_angle, half_edges
 
 SHARP_DEG = 40  # between the normals of two faces; below, a triangle across the edge is off by a fifth of its side
-_SHORTEST = 2.0  # spacings; shorter lines of sharp edges are roughness at this scale
+_SHORTEST = 6.0  # spacings; shorter lines of sharp edges are roughness at this scale
+_KNIFE_DEG, _SHORTEST_KNIFE = 75, 1.5  # unless so much of one is sharper than this
+_BRANCH = 1.0  # spacings; shorter dead ends are roughness, too
+_STRAY = 0.25  # spacings that a line may stray from a straight one without turning a corner
 _CORNER = np.cos(np.deg2rad(45))
 
 
@@ -51,45 +54,93 @@ def feature_lines(vertices, faces, opposite, crease, spacing):
     h = np.arange(len(opposite))
     once = h > opposite  # boundaries, and one half-edge of all others
     must = once & ((opposite < 0) | crease)
-    sharp = once & ~must & (
-        edge_normals_angle(vertices, faces, opposite) > np.deg2rad(SHARP_DEG)
-    )
+    angle = edge_normals_angle(vertices, faces, opposite)
+    sharp = once & ~must & (angle > np.deg2rad(SHARP_DEG))
     half = np.flatnonzero(must | sharp)
     ends = np.stack([start[half], end[half]], axis=1).astype(np.int64)
-    keep = must[half] | _long_enough(vertices, ends, _SHORTEST * spacing)
+    length = np.linalg.norm(vertices[ends[:, 1]] - vertices[ends[:, 0]], axis=1)
+    keep = _without_branches(ends, length, must[half], _BRANCH * spacing)
+    line = _lines(ends[keep])
+    long = np.bincount(line, length[keep])[line] > _SHORTEST * spacing
+    knife = np.bincount(line, length[keep] * (angle[half[keep]] > np.deg2rad(_KNIFE_DEG)))[line]
+    keep[keep] &= must[half[keep]] | long | (knife > _SHORTEST_KNIFE * spacing)
     half, ends = half[keep], ends[keep]
-    kind, after = _continuations(vertices, ends)
+    kind, after = _continuations(vertices, ends, _STRAY * spacing)
     return FeatureLines(ends, half, after, kind)
 
 
-def _long_enough(vertices, ends, shortest):
-    """Which edges belong to connected lines that are longer than `shortest` together."""
+def _lines(ends):
+    """Number of the connected line that each edge belongs to."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n = len(vertices)
+    n = int(ends.max(initial=0)) + 1
     graph = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), (n, n))
-    _, line = connected_components(graph, directed=False)
-    length = np.linalg.norm(vertices[ends[:, 1]] - vertices[ends[:, 0]], axis=1)
-    return np.bincount(line[ends[:, 0]], length)[line[ends[:, 0]]] > shortest if len(ends) else []
+    return connected_components(graph, directed=False)[1][ends[:, 0]]
 
 
-def _continuations(vertices, ends):
+def _without_branches(ends, length, must, shortest):
+    """Which edges are left when dead ends shorter than `shortest` are cut off from lines, (e,) bool."""
+    keep = np.ones(len(ends), bool)
+    n = int(ends.max(initial=0)) + 1
+    for _ in range(2):
+        degree = np.bincount(ends[keep].ravel(), minlength=n)
+        _, after = _sides(ends, np.where(keep[:, None], degree[ends], 0))
+        drop = np.zeros(len(ends), bool)
+        for e in np.flatnonzero(keep & (degree[ends] == 1).any(axis=1)):
+            path, total = [e], length[e]
+            side = 0 if degree[ends[e, 0]] == 1 else 1
+            # from the dead end inwards to a branching
+            here, side = e, 1 - side
+            while degree[ends[here, side]] == 2 and total < shortest:
+                other = after[here, side]
+                side = 1 if ends[other, 0] == ends[here, side] else 0
+                here = other
+                path.append(here)
+                total += length[here]
+            if total < shortest and degree[ends[here, side]] > 2 and not must[path].any():
+                drop[path] = True
+        keep &= ~drop
+        if not drop.any():
+            break
+    return keep
+
+
+def _sides(ends, degree):
+    """Pairs (k, 2) of sides 2 e + end that meet where the degree is 2, and the edge (e, 2) beyond each side."""
+    flat = ends.ravel()
+    joined = np.flatnonzero(degree.ravel() == 2)
+    joined = joined[np.argsort(flat[joined], kind="stable")].reshape(-1, 2)
+    after = np.full(len(flat), -1, np.int32)
+    after[joined[:, 0]], after[joined[:, 1]] = joined[:, 1] // 2, joined[:, 0] // 2
+    return joined, after.reshape(-1, 2)
+
+
+def _continuations(vertices, ends, stray):
     """Kinds of the vertices and, for each end of each edge, the edge that goes on there."""
-    n, e = len(vertices), len(ends)
+    n = len(vertices)
     degree = np.bincount(ends.ravel(), minlength=n)
     kind = np.minimum(degree, 1).astype(np.uint8)
     kind[(degree > 0) & (degree != 2)] = 2
-    after = np.full((e, 2), -1, np.int32)
-    # the two sides (edge, end) that meet at each vertex of degree 2
-    side = np.argsort(ends.ravel(), kind="stable")
-    side = side[degree[ends.ravel()[side]] == 2].reshape(-1, 2)
-    at = ends.ravel()[side[:, 0]]
-    away = vertices[ends.ravel()[side ^ 1]] - vertices[at][:, None]
-    away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-300)
-    straight = np.einsum("kx,kx->k", away[:, 0], away[:, 1]) < -_CORNER
-    kind[at[~straight]] = 2
-    here, there = side[straight].T
-    after.ravel()[here] = there // 2
-    after.ravel()[there] = here // 2
+    joined, after = _sides(ends, degree[ends])
+    neighbours = np.full((n, 2), -1, np.int64)
+    neighbours[ends.ravel()[joined[:, 0]]] = ends.ravel()[joined ^ 1]
+    for a in ends.ravel()[joined[:, 0]]:
+        if kind[a] == 1 and _turns(vertices, neighbours, a, stray):
+            kind[a] = 2
+    after[kind[ends] == 2] = -1
     return kind, after
+
+
+def _turns(vertices, neighbours, a, stray):
+    """Whether a line turns by over 45 degrees at a, seen over more than `stray` to both sides."""
+    away = []
+    for side in range(2):
+        before, here = a, neighbours[a, side]
+        gap = vertices[here] - vertices[a]
+        while gap @ gap < stray**2 and neighbours[here, 0] >= 0 and here != a:
+            first, second = neighbours[here]
+            before, here = here, second if first == before else first
+            gap = vertices[here] - vertices[a]
+        away.append(gap / max(np.sqrt(gap @ gap), 1e-300))
+    return away[0] @ away[1] > -_CORNER

@@ -1,7 +1,7 @@
 """Closest points near a known one: points walk over the input mesh, face by face.
 
 A global search for the closest point may land on the other side of a thin wall. A walk cannot: it goes
-from a face to its neighbours for as long as that brings it nearer.
+from a face to its neighbours for as long as that brings it nearer, and it does not cross feature lines.
 """
 
 import numpy as np
@@ -74,14 +74,14 @@ def _on_face(vertices, faces, f, p):
 
 
 @njit(cache=True, nogil=True)
-def _best_around(vertices, faces, opposite, f, k, p, best):
+def _best_around(vertices, faces, across, f, k, p, best):
     """The face around corner k of face f that comes nearest to p, and the squared distance; f and `best` if none does."""
     found, least = f, best * _NEARER
     for side in range(2):
         h = 3 * f + k
         for _ in range(_MOST_STEPS):
             # turn about the corner: across the edge before it, or across the edge after it
-            g = opposite[h - 1 if h % 3 > 0 else h + 2] if side == 0 else opposite[h]
+            g = across[h - 1 if h % 3 > 0 else h + 2] if side == 0 else across[h]
             if g < 0:
                 break
             h = g if side == 0 else (g + 1 if g % 3 < 2 else g - 2)
@@ -94,7 +94,7 @@ def _best_around(vertices, faces, opposite, f, k, p, best):
 
 
 @njit(cache=True, nogil=True)
-def _walk(vertices, faces, opposite, f, p):
+def _walk(vertices, faces, across, f, p):
     """Face and barycentric coordinates of the locally closest point to p, walking from face f."""
     u, v, w, best = _on_face(vertices, faces, f, p)
     for _ in range(_MOST_STEPS):
@@ -104,14 +104,14 @@ def _walk(vertices, faces, opposite, f, p):
         if outside == 1:
             # on the edge across from the corner without weight
             h = 3 * f + (1 if u == 0.0 else (2 if v == 0.0 else 0))
-            g = opposite[h]
+            g = across[h]
             if g < 0 or not _on_face(vertices, faces, g // 3, p)[3] < best * _NEARER:
                 break
             f = g // 3
         else:
             k = 0 if u > 0.0 else (1 if v > 0.0 else 2)
             g = f
-            f, _ = _best_around(vertices, faces, opposite, f, k, p, best)
+            f, _ = _best_around(vertices, faces, across, f, k, p, best)
             if f == g:
                 break
         u, v, w, best = _on_face(vertices, faces, f, p)
@@ -119,15 +119,15 @@ def _walk(vertices, faces, opposite, f, p):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def walk_faces(vertices, faces, opposite, points, face, weights, nearest):
+def walk_faces(vertices, faces, across, points, face, weights, nearest, blocked):
     """Bring points to the locally closest ones of a mesh, walking from given faces.
 
     Parameters
     ----------
     vertices : (n, 3) float64
     faces : (m, 3) int32
-    opposite : (3 m,) int32
-        See `topology.opposite_half_edges`.
+    across : (3 m,) int32
+        The half-edge on the other side of each, -1 where walks end: on boundaries and feature lines.
     points : (k, 3) float64
     face : (k,) int32
         Where each walk starts; filled with where it ends.
@@ -135,10 +135,17 @@ def walk_faces(vertices, faces, opposite, points, face, weights, nearest):
         Filled with barycentric coordinates there.
     nearest : (k, 3) float64
         Filled with the closest points.
+    blocked : (k,) uint8
+        Filled: 1 where a walk ended on a boundary or a feature line.
     """
     for i in prange(len(points)):
-        f, u, v, w = _walk(vertices, faces, opposite, face[i], _row(points, i))
+        f, u, v, w = _walk(vertices, faces, across, face[i], _row(points, i))
         face[i] = f
+        blocked[i] = (
+            (w == 0.0 and across[3 * f] < 0)
+            or (u == 0.0 and across[3 * f + 1] < 0)
+            or (v == 0.0 and across[3 * f + 2] < 0)
+        )
         weights[i, 0], weights[i, 1], weights[i, 2] = u, v, w
         for x in range(3):
             nearest[i, x] = (

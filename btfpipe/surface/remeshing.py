@@ -11,11 +11,15 @@ from btfpipe.errors import InputError
 from btfpipe.surface import _edges
 from btfpipe.surface.feature_lines import feature_lines
 from btfpipe.surface.projection import walk_faces, walk_lines
-from btfpipe.surface.topology import half_edges, mesh_area
+from btfpipe.surface.topology import edge_normals_angle, face_normals, half_edges, mesh_area
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
 _MORE_ROUNDS = 6
-_HELD = 0.3  # spacings that a corner of the input may lie off
+_HELD, _LEFT = 0.3, 0.4  # spacings that a point of the input may lie off, on the way and in the end
+_MORE_PINS = 4
+_MOST_REVERTS = 3
+_BENT_DEG = 20  # of edges along which points are held
+_MOST_PARTS = 1000
 _MOST_GROWTH = 16  # times the vertices wanted and given; sound meshes stay below twice
 
 
@@ -38,9 +42,11 @@ class _Mesh:
         self.corner = source.faces.ravel().astype(np.int32)
         self.opposite, self.feature = source.opposite.copy(), np.zeros(3 * m, np.int32)
         self._mark(lines.half, 1 + np.arange(len(lines.half)))
+        self.across = np.where(self.feature > 0, -1, source.opposite).astype(np.int32)
         self.origin = np.arange(m, dtype=np.int32)
         self.leave, self.kind, self.place, self.along = leave, lines.kind.copy(), place, along
         self.points, self.flat = source.vertices.copy(), source.vertices.copy()
+        self.normals = face_normals(source.vertices, source.faces)
 
     def _mark(self, half, numbers):
         """Set the numbers of feature edges, on both sides of each."""
@@ -71,7 +77,6 @@ class _Mesh:
         line = number[1 + self.along[made]]
         self.kind[made], self.along[made] = line > 0, line - 1
         self.feature[: 3 * self.n_faces] = number[self.feature[: 3 * self.n_faces]]
-        self.origin[:] = -1
 
     def _grow(self):
         for name in (
@@ -95,7 +100,7 @@ class _Mesh:
 
     def collapse(self, shortest, longest, least=0.2):
         count = _edges.collapse_short(
-            *self._tables(), self.kind, self.origin, self.points, self.flat, self.n_faces,
+            *self._tables(), self.kind, self.points, self.flat, self.n_faces,
             shortest, longest, least,
         )  # fmt: skip
         self.n_vertices, self.n_faces = _edges.compact(
@@ -106,7 +111,7 @@ class _Mesh:
 
     def flip(self, by_degree):
         return _edges.flip_edges(
-            *self._tables(), self.origin, self.points, self.n_faces, by_degree
+            *self._tables(), self.points, self.n_faces, by_degree
         )
 
     def smooth(self, reach):
@@ -118,31 +123,49 @@ class _Mesh:
     def settle(self, step, reach):
         """Bring flat positions plus `step` back to the input and lift them onto the smooth surface.
 
-        A vertex that would jump stays where it was.
+        A vertex that would jump, or turn a face over, stays where it was. Returns the face and weights of each.
         """
-        n, source, lines = self.n_vertices, self.source, self.lines
+        n = self.n_vertices
         wanted = self.flat[:n] + step
-        place = self.place[:n].copy()
-        weights, nearest = np.empty((n, 3)), np.empty((n, 3))
-        surface = source.vertices, source.faces, source.opposite
-        walk_faces(*surface, wanted, place, weights, nearest)
-        jump = np.flatnonzero(np.linalg.norm(nearest - wanted, axis=1) > reach)
-        if len(jump):
-            back, w, x = self.place[jump], np.empty((len(jump), 3)), np.empty((len(jump), 3))
-            walk_faces(*surface, self.flat[jump], back, w, x)
-            place[jump], weights[jump], nearest[jump] = back, w, x
-        bound = np.flatnonzero(self.kind[:n] == 1)
+        place, along, weights, nearest, blocked = self._project(
+            wanted, self.kind[:n], self.place[:n], self.along[:n]
+        )
+        blocked[self.kind[:n] > 0] = 0
+        stay = np.flatnonzero((np.linalg.norm(nearest - wanted, axis=1) > reach) | (blocked > 0))
+        for _ in range(_MOST_REVERTS):
+            if len(stay):
+                place[stay], along[stay], weights[stay], nearest[stay], _ = self._project(
+                    self.flat[stay], self.kind[stay], self.place[stay], self.along[stay]
+                )
+            keep = np.zeros(n, np.uint8)
+            if not _edges.folded(
+                self.corner, self.n_faces, self.flat, self.place, nearest, place, self.normals, keep
+            ):
+                break
+            stay = np.flatnonzero(keep)
+        self.place[:n], self.along[:n], self.flat[:n] = place, along, nearest
+        self.points[:n] = self.source.lift(place, weights)
+        _edges.name_origins(self.corner, self.n_faces, self.kind, self.place, self.origin)
+        return place, weights
+
+    def _project(self, wanted, kind, place, along):
+        """Places, feature edges, weights and positions of the closest points of the input, near known ones."""
+        source, lines = self.source, self.lines
+        place, along = place.copy(), along.copy()
+        weights, nearest = np.empty((len(wanted), 3)), np.empty((len(wanted), 3))
+        blocked = np.zeros(len(wanted), np.uint8)
+        walk_faces(
+            source.vertices, source.faces, self.across, wanted, place, weights, nearest, blocked
+        )
+        bound = np.flatnonzero(kind == 1)
         if len(bound):
-            edge, part, x = self.along[bound], np.empty(len(bound)), np.empty((len(bound), 3))
+            edge, part, x = along[bound], np.empty(len(bound)), np.empty((len(bound), 3))
             walk_lines(source.vertices, lines.ends, lines.after, wanted[bound], edge, part, x)
             half, rows = lines.half[edge], np.arange(len(bound))
             w = np.zeros((len(bound), 3))
             w[rows, half % 3], w[rows, (half + 1) % 3] = 1 - part, part
-            self.along[bound] = edge
-            place[bound], weights[bound], nearest[bound] = half // 3, w, x
-        self.place[:n], self.flat[:n] = place, nearest
-        self.points[:n] = source.lift(place, weights)
-        return place.copy(), weights
+            along[bound], place[bound], weights[bound], nearest[bound] = edge, half // 3, w, x
+        return place, along, weights, nearest, blocked
 
     def faces(self):
         return self.corner[: 3 * self.n_faces].reshape(-1, 3)
@@ -177,12 +200,12 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
     lines = feature_lines(source.vertices, source.faces, source.opposite, source.crease, target)
     mesh = _Mesh(source, lines)
     mesh.cut(target)
-    tips = _Tips(source)
+    held = _Held(source, lines, target)
     rounds = polish + settle
     for i in range(polish + _MORE_ROUNDS):
         _round(mesh, target)
         if i % 2:
-            tips.hold(mesh, _HELD * target, target)
+            held.pin(mesh, _HELD * target, target)
         off = mesh.n_vertices / n_vertices
         if i + 1 >= polish and abs(off - 1) < 0.02:
             break
@@ -193,46 +216,68 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
         face, weights = mesh.smooth(0.5 * target)
         mesh.flip(i < settle // 2)
         report(polish + i, rounds)
+    for _ in range(_MORE_PINS):
+        if not held.pin(mesh, _LEFT * target, target):
+            break
+        for _ in range(2):
+            face, weights = mesh.smooth(0.5 * target)
+            mesh.flip(False)
     points = mesh.points[: mesh.n_vertices]
     return _in_order(mesh.faces(), points, face, weights)
 
 
-class _Tips:
-    """Corners of the input that a resampling must not cut off."""
+class _Held:
+    """Points of the input that a resampling must not lose: its vertices, and places on sharp edges that are no lines."""
 
-    def __init__(self, source):
-        self.source = source
-        start, _ = half_edges(source.faces)
-        self.face = np.empty(len(source.vertices), np.int32)
-        self.face[start] = np.arange(len(start)) // 3
+    def __init__(self, source, lines, spacing):
+        start, end = half_edges(source.faces)
+        half = np.arange(len(start))
+        angle = edge_normals_angle(source.vertices, source.faces, source.opposite)
+        angle[lines.half] = 0
+        sharp = (half > source.opposite) & (angle > np.deg2rad(_BENT_DEG))
+        length = np.linalg.norm(source.vertices[end] - source.vertices[start], axis=1)
+        parts = np.where(sharp, np.minimum(2 * length / spacing, _MOST_PARTS).astype(int), 0)
+        first = np.empty(len(source.vertices), np.int64)
+        first[start] = half
+        along = np.repeat(half, parts)
+        part = np.arange(len(along)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
+        share = np.r_[np.zeros(len(first)), part / (parts[along] + 1)]
+        half = np.r_[first, along]
+        self.face = (half // 3).astype(np.int32)
+        self.points = (1 - share)[:, None] * source.vertices[start[half]] + share[
+            :, None
+        ] * source.vertices[end[half]]
 
-    def hold(self, mesh, bound, spacing):
-        """Move a free vertex to each vertex of the input that lies farther from the mesh than `bound`, and pin it."""
+    def pin(self, mesh, bound, spacing):
+        """Move a free vertex to each held point that lies farther from the mesh than `bound`, and pin it.
+
+        Points closer to each other than 0.7 spacings share one. Returns how many were pinned.
+        """
         import igl
         from scipy.spatial import cKDTree
 
         flat, faces = mesh.flat[: mesh.n_vertices], mesh.faces()
         squared, nearest, _ = igl.point_mesh_squared_distance(
-            self.source.vertices, np.ascontiguousarray(flat), faces.astype(np.int64)
+            self.points, np.ascontiguousarray(flat), faces.astype(np.int64)
         )
         lost = np.flatnonzero(squared > bound**2)
         if not len(lost):
             return 0
         lost = lost[np.argsort(-squared[lost], kind="stable")]
-        tree = cKDTree(self.source.vertices[lost])
+        tree = cKDTree(self.points[lost])
         taken = np.zeros(len(lost), bool)
         done = 0
-        for i, v in enumerate(lost):
+        for i, p in enumerate(lost):
             if taken[i]:
                 continue
-            taken[tree.query_ball_point(self.source.vertices[v], 0.7 * spacing)] = True
-            corners = faces[nearest[v]]
+            taken[tree.query_ball_point(self.points[p], 0.7 * spacing)] = True
+            corners = faces[nearest[p]]
             free = corners[mesh.kind[corners] == 0]
             if len(free):
-                gap = np.linalg.norm(flat[free] - self.source.vertices[v], axis=1)
+                gap = np.linalg.norm(flat[free] - self.points[p], axis=1)
                 c = free[gap.argmin()]
-                mesh.flat[c] = mesh.points[c] = self.source.vertices[v]
-                mesh.kind[c], mesh.place[c] = 2, self.face[v]
+                mesh.flat[c] = mesh.points[c] = self.points[p]
+                mesh.kind[c], mesh.place[c] = 2, self.face[p]
                 done += 1
         return done
 

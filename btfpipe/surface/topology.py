@@ -48,6 +48,14 @@ def edge_normals_angle(vertices, faces, opposite):
     return np.where(opposite < 0, 0.0, angle)
 
 
+def face_normals(vertices, faces):
+    """Unit normals of the faces, (m, 3) float64; 0 where a face has no area."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return np.divide(across, length, out=np.zeros_like(across), where=length > 0)
+
+
 def mesh_area(vertices, faces):
     """Area of all faces together."""
     corners = vertices[faces]
