@@ -20,6 +20,7 @@ _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and osc
 _FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge
 _TURNED = 0.5  # cosine of the turn of a normal that makes a fold
 _STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
+_BESIDE = 0.4  # weight of a line's neighbours beside it, against 1 on it
 _RING = 96  # vertices of more neighbours than this are left alone
 
 
@@ -205,6 +206,30 @@ def split_long(
             if leave[b] == h1:
                 leave[b] = f + 1
     return n_vertices, n_faces, True
+
+
+@njit(cache=True, nogil=True)
+def insert_vertex(corner, opposite, feature, leave, origin, face, m, n_faces):
+    """Cut a face into three around the new vertex m; two faces go behind the last. Returns the number of faces."""
+    h, e, g = 3 * face, 3 * n_faces, 3 * n_faces + 3
+    a, b, c = corner[h], corner[h + 1], corner[h + 2]
+    beyond_b, mark_b = opposite[h + 1], feature[h + 1]
+    beyond_c, mark_c = opposite[h + 2], feature[h + 2]
+    corner[h + 2] = m
+    corner[e], corner[e + 1], corner[e + 2] = b, c, m
+    corner[g], corner[g + 1], corner[g + 2] = c, a, m
+    origin[n_faces] = origin[n_faces + 1] = origin[face]
+    _join(opposite, feature, e, beyond_b, mark_b)
+    _join(opposite, feature, g, beyond_c, mark_c)
+    _join(opposite, feature, h + 1, e + 2, 0)
+    _join(opposite, feature, e + 1, g + 2, 0)
+    _join(opposite, feature, g + 1, h + 2, 0)
+    leave[m] = h + 2
+    if leave[b] == h + 1:
+        leave[b] = e
+    if leave[c] == h + 2:
+        leave[c] = g
+    return n_faces + 2
 
 
 @njit(cache=True, nogil=True)
@@ -535,7 +560,8 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
     """Fill `step` with each vertex's move towards the middle of its neighbours, within the tangent plane.
 
     Neighbours are weighted by the areas around the edge to them, so that crowded vertices spread.
-    Vertices of kind 1 move towards the middle of their two feature neighbours, those of kind 2 stay.
+    Vertices of kind 1 move along their line, towards the middle of its two neighbours and a little towards that
+    of all others, so that vertices on lines close to each other interleave. Those of kind 2 stay.
     """
     for v in prange(n_vertices):
         step[v, 0] = step[v, 1] = step[v, 2] = 0.0
@@ -544,14 +570,20 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             continue
         x, y, z = points[v, 0], points[v, 1], points[v, 2]
         nx = ny = nz = cx = cy = cz = total = 0.0
+        # of a line: where it goes on either way
+        fx = fy = fz = gx = gy = gz = 0.0
         while True:
             b, c = corner[_next(h)], corner[_previous(h)]
             if kind[v] == 1:
+                weight = _BESIDE
                 if feature[h]:
-                    cx += points[b, 0]
-                    cy += points[b, 1]
-                    cz += points[b, 2]
-                    total += 1.0
+                    weight = 1.0
+                    gx, gy, gz = fx, fy, fz
+                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
+                cx += weight * points[b, 0]
+                cy += weight * points[b, 1]
+                cz += weight * points[b, 2]
+                total += weight
             else:
                 ex, ey, ez = _cross(
                     x, y, z,
@@ -571,6 +603,8 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             if h < 0:
                 if kind[v] == 1:
                     b = corner[p]
+                    gx, gy, gz = fx, fy, fz
+                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
                     cx += points[b, 0]
                     cy += points[b, 1]
                     cz += points[b, 2]
@@ -586,6 +620,11 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             if n2 > 0.0:
                 k = (dx * nx + dy * ny + dz * nz) / n2
                 dx, dy, dz = dx - k * nx, dy - k * ny, dz - k * nz
+        else:
+            fx, fy, fz = fx - gx, fy - gy, fz - gz
+            f2 = fx * fx + fy * fy + fz * fz
+            k = (dx * fx + dy * fy + dz * fz) / f2 if f2 > 0.0 else 0.0
+            dx, dy, dz = k * fx, k * fy, k * fz
         step[v, 0], step[v, 1], step[v, 2] = _DAMPING * dx, _DAMPING * dy, _DAMPING * dz
 
 

@@ -6,7 +6,9 @@ import numpy as np
 
 from btfpipe.surface.topology import edge_normals_angle, half_edges
 
-SHARP_DEG = 40  # between the normals of two faces; below, a triangle across the edge is off by a fifth of its side
+# between the normals of two faces that make a sharp edge, of edges longer and shorter than a spacing: a triangle across
+# an edge of 40 degrees is off by a fifth of its side; short ones are roughness more often than shape
+SHARP_DEG, SHORT_SHARP_DEG = 40, 60
 _SHORTEST = 6.0  # spacings; shorter lines of sharp edges are roughness at this scale
 _KNIFE_DEG, _SHORTEST_KNIFE = 75, 1.5  # unless so much of one is sharper than this
 _BRANCH = 1.0  # spacings; shorter dead ends are roughness, too
@@ -55,7 +57,8 @@ def feature_lines(vertices, faces, opposite, crease, spacing):
     once = h > opposite  # boundaries, and one half-edge of all others
     must = once & ((opposite < 0) | crease)
     angle = edge_normals_angle(vertices, faces, opposite)
-    sharp = once & ~must & (angle > np.deg2rad(SHARP_DEG))
+    long = np.linalg.norm(vertices[end] - vertices[start], axis=1) > spacing
+    sharp = once & ~must & (angle > np.deg2rad(np.where(long, SHARP_DEG, SHORT_SHARP_DEG)))
     half = np.flatnonzero(must | sharp)
     ends = np.stack([start[half], end[half]], axis=1).astype(np.int64)
     length = np.linalg.norm(vertices[ends[:, 1]] - vertices[ends[:, 0]], axis=1)

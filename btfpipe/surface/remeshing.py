@@ -109,6 +109,24 @@ class _Mesh:
         )  # fmt: skip
         return count
 
+    def pin(self, face, point, place):
+        """Pin the nearest free corner of a face to a point of the input, or a new vertex if all are bound."""
+        corners = self.corner[3 * face : 3 * face + 3]
+        free = corners[self.kind[corners] == 0]
+        if len(free):
+            v = free[np.linalg.norm(self.flat[free] - point, axis=1).argmin()]
+        else:
+            if self.n_vertices + 1 > len(self.points) or 3 * (self.n_faces + 2) > len(self.corner):
+                self._grow()
+            v = self.n_vertices
+            self.n_vertices += 1
+            self.n_faces = _edges.insert_vertex(
+                *self._tables(), self.origin, face, v, self.n_faces
+            )
+            self.along[v] = -1
+        self.flat[v] = self.points[v] = point
+        self.kind[v], self.place[v] = 2, place
+
     def flip(self, by_degree):
         return _edges.flip_edges(
             *self._tables(), self.points, self.n_faces, by_degree
@@ -249,7 +267,7 @@ class _Held:
         ] * source.vertices[end[half]]
 
     def pin(self, mesh, bound, spacing):
-        """Move a free vertex to each held point that lies farther from the mesh than `bound`, and pin it.
+        """Pin a vertex to each held point that lies farther from the mesh than `bound`.
 
         Points closer to each other than 0.7 spacings share one. Returns how many were pinned.
         """
@@ -271,14 +289,8 @@ class _Held:
             if taken[i]:
                 continue
             taken[tree.query_ball_point(self.points[p], 0.7 * spacing)] = True
-            corners = faces[nearest[p]]
-            free = corners[mesh.kind[corners] == 0]
-            if len(free):
-                gap = np.linalg.norm(flat[free] - self.points[p], axis=1)
-                c = free[gap.argmin()]
-                mesh.flat[c] = mesh.points[c] = self.points[p]
-                mesh.kind[c], mesh.place[c] = 2, self.face[p]
-                done += 1
+            mesh.pin(nearest[p], self.points[p], self.face[p])
+            done += 1
         return done
 
 
