@@ -46,6 +46,7 @@ class _Mesh:
         self.origin = np.arange(m, dtype=np.int32)
         self.leave, self.kind, self.place, self.along = leave, lines.kind.copy(), place, along
         self.points, self.flat = source.vertices.copy(), source.vertices.copy()
+        self.most = np.inf
         self.normals = face_normals(source.vertices, source.faces)
 
     def _mark(self, half, numbers):
@@ -79,6 +80,11 @@ class _Mesh:
         self.feature[: 3 * self.n_faces] = number[self.feature[: 3 * self.n_faces]]
 
     def _grow(self):
+        if len(self.points) > self.most:
+            raise InputError(
+                f"edges are split without end (over {self.most} vertices): a corner sticks out far beyond its surroundings."
+                " Try without smoothing (--no-smooth)."
+            )
         for name in (
             "corner", "opposite", "feature", "origin", "leave", "kind", "place", "along", "points", "flat",
         ):  # fmt: skip
@@ -218,6 +224,7 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
     lines = feature_lines(source.vertices, source.faces, source.opposite, source.crease, target)
     mesh = _Mesh(source, lines)
     mesh.cut(target)
+    mesh.most = _MOST_GROWTH * (n_vertices + mesh.n_vertices)
     held = _Held(source, lines, target)
     rounds = polish + settle
     for i in range(polish + _MORE_ROUNDS):

@@ -38,16 +38,20 @@ class SmoothInput:
     ease: np.ndarray
     alpha: float
 
+    def flat(self, face, weights):
+        """Positions on the faces themselves, (k, 3) float64."""
+        return np.einsum("kc,kcx->kx", weights, self.vertices[self.faces[face]])
+
     def lift(self, face, weights):
         """Positions on the smooth surface, (k, 3) float64 (Boubekeur and Alexa 2008, eq. 3).
 
         The point is pulled towards the mean of its projections onto the tangent planes of its face's
         corners. Unlike there the pull fades towards creases, where the two sides would part.
         """
-        corners = self.vertices[self.faces[face]]
-        flat = np.einsum("kc,kcx->kx", weights, corners)
+        flat = self.flat(face, weights)
         if self.alpha == 0:
             return flat
+        corners = self.vertices[self.faces[face]]
         normals = self.corner_normals[face]
         above = np.einsum("kcx,kcx->kc", flat[:, None] - corners, normals)
         pull = np.einsum("kc,kc,kcx->kx", weights, above, normals)

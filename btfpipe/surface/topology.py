@@ -36,6 +36,17 @@ def edges(faces):
     return np.stack([keys // base, keys % base], axis=1)
 
 
+def edge_lengths(vertices, faces):
+    """Length of each undirected edge, (e,) float64, in the order of `edges`."""
+    a, b = edges(faces).T
+    return np.linalg.norm(vertices[a] - vertices[b], axis=1)
+
+
+def mean_edge(vertices, faces):
+    """Mean length of the undirected edges: the spacing of an even mesh."""
+    return float(edge_lengths(vertices, faces).mean())
+
+
 def edge_normals_angle(vertices, faces, opposite):
     """Angle between the normals of the two faces at each half-edge, (3 m,) float64; 0 on a boundary."""
     corners = vertices[faces]
