@@ -1,0 +1,338 @@
+"""Which faces of a mesh are neighbours, also where more than two meet at an edge.
+
+A pairing of half-edges decides everything else: parts are what it connects, and each fan of faces that it connects around a
+position gets a vertex of its own. What it leaves unpaired is a boundary. So cutting along an edge, keeping parts that touch
+apart, and parting the fans of a vertex are one operation (Guéziec, Taubin, Lazarus and Horn, *Cutting and stitching: converting
+sets of polygons to manifold surfaces*, TVCG 2001, whose local cuts these are).
+
+Half-edge ``3 f + k`` leaves corner k of face f. An edge is where half-edges run between the same two positions; its faces are
+paired
+
+1. if there are two of them;
+2. if two of them share the edge's two *vertices in the file* and no other face does;
+3. if directions alternate around the edge, as they do where solids touch: the two faces that bound one piece of inside;
+4. else of opposite directions, best first: faces connected elsewhere, then faces whose parts have no boundary elsewhere, then
+   the pair that continues most nearly straight on.
+"""
+
+import numpy as np
+from numba import njit
+
+_SAME_ANGLE = 1e-7  # radians; faces that lie on each other
+_MOST_COMPARED = 64  # half-edges of an edge of which every two are compared
+
+
+def pair_half_edges(vertices, faces, alias):
+    """Pair the half-edges of neighbours.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+        Distinct positions.
+    faces : (m, 3) int32
+        Corners as positions, three different ones.
+    alias : (m, 3) int
+        Corners as vertices of the file.
+
+    Returns
+    -------
+    opposite : (3 m,) int32
+        The other half-edge of the pair, -1 on a boundary.
+    sense : (m,) int8
+        -1 for faces to be turned, so that the two half-edges of each pair run in opposite directions; most of the area of
+        the faces that rules 1 and 2 connect keeps its own.
+    crowded : int
+        Edges of more than two faces.
+    cut : int
+        Edges of two faces that are left unpaired because the surface is one-sided.
+    """
+    start, end = sides(faces)
+    edge = order, run, counts = runs(undirected(start, end))
+    opposite = np.full(faces.size, -1, np.int32)
+    join_twos(opposite, *edge)
+    crowded = np.flatnonzero(counts[run] > 2)
+    left, number = _join_by_file(opposite, order[crowded], run[crowded], *sides(alias))
+    sense, patch, cut = _orient_patches(vertices, faces, opposite, start)
+    if len(left):
+        undecided = np.zeros(faces.size, bool)
+        undecided[left] = True
+        rim = np.zeros(patch.max() + 1, bool)
+        rim[patch[np.flatnonzero((opposite < 0) & ~undecided) // 3]] = True
+        facing = _facing(vertices, faces, sense, order, run)
+        _match_crowded(vertices, faces, opposite, left, number, sense, patch, rim, facing)
+    return opposite, sense, int((counts > 2).sum()), cut
+
+
+def sides(corners):
+    """Start and end of each half-edge, (3 m,) each, of a table of corners (m, 3)."""
+    return corners.ravel(), corners[:, [1, 2, 0]].ravel()
+
+
+def undirected(a, b):
+    """One integer, (n,) int64, for each unordered pair of numbers below 2^31."""
+    a, b = a.astype(np.int64), b.astype(np.int64)
+    return (np.minimum(a, b) << 31) | np.maximum(a, b)
+
+
+def runs(keys):
+    """An order that puts equal keys side by side, the run that each of it belongs to, and the lengths of runs."""
+    order = np.argsort(keys, kind="stable")
+    new = np.r_[True, np.diff(keys[order]) != 0][: len(keys)]
+    run = np.cumsum(new) - 1
+    return order, run, np.bincount(run)
+
+
+def join_twos(opposite, order, run, counts):
+    """Pair the half-edges of runs of exactly two."""
+    two = order[counts[run] == 2].reshape(-1, 2)
+    opposite[two[:, 0]] = two[:, 1]
+    opposite[two[:, 1]] = two[:, 0]
+
+
+def _join_by_file(opposite, order, run, start, end):
+    """Rule 2, and rule 1 again for the rest; returns what is still undecided, as `order` and `run`."""
+    if not len(order):
+        return order, run
+    key = undirected(start[order], end[order])
+    within = np.lexsort((key, run))
+    new = np.r_[True, (np.diff(run[within]) != 0) | (np.diff(key[within]) != 0)]
+    number = np.cumsum(new) - 1
+    join_twos(opposite, order[within], number, np.bincount(number))
+    left = opposite[order] < 0
+    order, run = order[left], run[left]
+    counts = np.bincount(run)
+    join_twos(opposite, order, run, counts)
+    left = counts[run] > 2
+    return order[left], run[left]
+
+
+def _facing(vertices, faces, sense, order, run):
+    """-1 for faces of clusters that are inside out, else 1; a cluster is what edges connect, however many faces they have."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    same = np.flatnonzero(np.diff(run) == 0)
+    m = len(faces)
+    graph = coo_matrix((np.ones(len(same), bool), (order[same] // 3, order[same + 1] // 3)), (m, m))
+    count, cluster = connected_components(graph, directed=False)
+    volume = signed_volumes(vertices, faces, cluster, count, sense)
+    return np.where(volume < 0, -1, 1)[cluster]
+
+
+def signed_volumes(vertices, faces, part, count, sense):
+    """Six times the volume of each part, (count,), about its own middle; positive if it is seen from outside."""
+    corners = vertices[faces]
+    size = np.maximum(np.bincount(part, minlength=count), 1)
+    middle = [np.bincount(part, corners[..., x].mean(axis=1), count) / size for x in range(3)]
+    a, b, c = np.moveaxis(corners - np.stack(middle, 1)[part][:, None], 1, 0)
+    return np.bincount(part, sense * np.einsum("fx,fx->f", a, np.cross(b, c)), count)
+
+
+def _orient_patches(vertices, faces, opposite, start):
+    """Spread orientation over pairs; where it disagrees with itself, unpair.
+
+    Returns the sense (m,) int8, the patch of each face (m,) int32, and the number of unpaired edges.
+    """
+    paired = np.flatnonzero(opposite >= 0)
+    agree = np.ones(len(opposite), bool)
+    agree[paired] = start[paired] != start[opposite[paired]]
+    if agree.all():
+        return np.ones(len(faces), np.int8), components(opposite)[1], 0
+    sense, patch = np.zeros(len(faces), np.int8), np.empty(len(faces), np.int32)
+    cut = _spread(opposite, agree, sense, patch)
+    weight = np.bincount(patch, sense * areas(vertices, faces))
+    sense[weight[patch] < 0] *= -1
+    return sense, patch, cut
+
+
+def components(opposite):
+    """Number of parts that a pairing connects, and the part of each face (m,) int32."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    h = np.flatnonzero(opposite > np.arange(len(opposite)))
+    m = len(opposite) // 3
+    graph = coo_matrix((np.ones(len(h), bool), (h // 3, opposite[h] // 3)), shape=(m, m))
+    return connected_components(graph, directed=False)
+
+
+def closed_parts(opposite):
+    """Which faces belong to parts without boundary, (m,) bool; the part of each face, (m,) int32, and their number."""
+    count, part = components(opposite)
+    whole = np.ones(count, bool)
+    whole[part[np.flatnonzero(opposite < 0) // 3]] = False
+    return whole[part], part, count
+
+
+def areas(vertices, faces):
+    """Area of each face, (m,) float64."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _match_crowded(vertices, faces, opposite, order, run, sense, patch, rim, facing):
+    """Rules 3 and 4, for half-edges `order` that lie edge by edge, as `run` counts."""
+    starts = np.flatnonzero(np.r_[True, np.diff(run) != 0])
+    size = np.diff(np.r_[starts, len(run)])
+    face, corner = order // 3, order % 3
+    tail, head = faces[face, corner], faces[face, (corner + 1) % 3]
+    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    origin = vertices[low]
+    axis = vertices[high] - origin
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    arm = vertices[faces[face, (corner + 2) % 3]] - origin
+    arm -= np.einsum("hx,hx->h", arm, axis)[:, None] * axis
+    right = np.repeat(arm[starts], size, axis=0)
+    up = np.cross(axis, right)
+    angle = np.arctan2(np.einsum("hx,hx->h", arm, up), np.einsum("hx,hx->h", arm, right))
+    angle %= 2 * np.pi
+    angle[angle > 2 * np.pi - _SAME_ANGLE] = 0
+    # counter-clockwise around the axis, the inside ends at a face that runs along it, unless the file is inside out
+    ends = (tail == low) == (sense * facing > 0)[face]
+    within = np.lexsort((order, angle, run))
+    _match(
+        opposite, order[within], starts, angle[within], ends[within], patch[face[within]], rim
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _spread(opposite, agree, sense, patch):
+    """Breadth-first, face by face; fill `sense` and `patch`, clear pairs that contradict them and count these."""
+    m = len(sense)
+    queue = np.empty(m, np.int32)
+    found = 0
+    cut = 0
+    for root in range(m):
+        if sense[root] != 0:
+            continue
+        sense[root] = 1
+        patch[root] = found
+        queue[0] = root
+        read, write = 0, 1
+        while read < write:
+            f = queue[read]
+            read += 1
+            for h in range(3 * f, 3 * f + 3):
+                g = opposite[h]
+                if g < 0:
+                    continue
+                wanted = sense[f] if agree[h] else -sense[f]
+                other = g // 3
+                if sense[other] == 0:
+                    sense[other] = wanted
+                    patch[other] = found
+                    queue[write] = other
+                    write += 1
+                elif sense[other] != wanted:
+                    opposite[h] = -1
+                    opposite[g] = -1
+                    cut += 1
+        found += 1
+    return cut
+
+
+@njit(cache=True, nogil=True)
+def _match(opposite, order, starts, angle, ends, patch, rim):
+    """Pair the half-edges of each edge, which are sorted by angle around it."""
+    n = len(order)
+    for i in range(len(starts)):
+        first = starts[i]
+        last = starts[i + 1] if i + 1 < len(starts) else n
+        ring = _alternated(angle[first:last], ends[first:last]) + first
+        size = last - first
+        alternates = True
+        for k in range(size):
+            if ends[ring[k]] == ends[ring[(k + 1) % size]]:
+                alternates = False
+        if alternates:
+            for k in range(size):
+                if not ends[ring[k]]:
+                    _join(opposite, order, ring[k], ring[(k + 1) % size])
+        elif size <= _MOST_COMPARED:
+            _match_by_score(opposite, order, first, last, angle, ends, patch, rim)
+        else:
+            _match_nested(opposite, order, ring, ends)
+
+
+@njit(cache=True, nogil=True)
+def _join(opposite, order, a, b):
+    opposite[order[a]] = order[b]
+    opposite[order[b]] = order[a]
+
+
+@njit(cache=True, nogil=True)
+def _alternated(angle, ends):
+    """The order around an edge, where faces that lie on each other are put in turns of ending and beginning."""
+    n = len(angle)
+    # start behind a gap, at a face that lies alone where there is one
+    begin = 0
+    for k in range(n):
+        gap = k == 0 or angle[k] - angle[k - 1] > _SAME_ANGLE
+        if gap and (k + 1 == n or angle[k + 1] - angle[k] > _SAME_ANGLE):
+            begin = k
+            break
+    ring = np.empty(n, np.int64)
+    used = np.zeros(n, np.bool_)
+    before = False
+    k = 0
+    while k < n:
+        # the faces that lie on this one
+        size = 1
+        here = (begin + k) % n
+        while k + size < n:
+            following = (begin + k + size) % n
+            if following == 0 or angle[following] - angle[following - 1] > _SAME_ANGLE:
+                break
+            size += 1
+        for _ in range(size):
+            pick = -1
+            for j in range(size):
+                at = (here + j) % n
+                if not used[at] and (pick < 0 or (ends[pick] == before and ends[at] != before)):
+                    pick = at
+            used[pick] = True
+            before = ends[pick]
+            ring[k] = pick
+            k += 1
+    return ring
+
+
+@njit(cache=True, nogil=True)
+def _match_by_score(opposite, order, first, last, angle, ends, patch, rim):
+    while True:
+        best, one, two = np.inf, -1, -1
+        for a in range(first, last):
+            if opposite[order[a]] >= 0:
+                continue
+            for b in range(a + 1, last):
+                if opposite[order[b]] >= 0 or ends[a] == ends[b]:
+                    continue
+                score = abs(abs(angle[a] - angle[b]) - np.pi)
+                if rim[patch[a]] or rim[patch[b]]:
+                    score += 10
+                if patch[a] != patch[b]:
+                    score += 20
+                if score < best - _SAME_ANGLE:
+                    best, one, two = score, a, b
+        if one < 0:
+            return
+        _join(opposite, order, one, two)
+
+
+@njit(cache=True, nogil=True)
+def _match_nested(opposite, order, ring, ends):
+    """As brackets match, around the edge twice; what has no partner stays."""
+    n = len(ring)
+    stack = np.empty(2 * n, np.int64)
+    height = 0
+    for k in range(2 * n):
+        at = ring[k % n]
+        if opposite[order[at]] >= 0:
+            continue
+        if not ends[at]:
+            if k < n:
+                stack[height] = at
+                height += 1
+        elif height > 0:
+            height -= 1
+            _join(opposite, order, stack[height], at)
