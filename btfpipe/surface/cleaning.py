@@ -88,7 +88,8 @@ def _check_finite(vertices, used, name):
     if len(bad):
         raise InputError(
             f"{name}: {len(bad)} of {int(used.sum())} vertices are not finite (first: vertex {bad[0]},"
-            f" counted from 0, {_place(vertices[bad[0]])}). Remove them or export the mesh again."
+            f" counted from 0, {_place(vertices[bad[0]])}). Remove their faces (remove_infinite_values of trimesh) or export the"
+            " mesh again."
         )
 
 
@@ -265,7 +266,7 @@ def _check_area(vertices, faces, name):
     if _pairing.areas(vertices, faces).sum() <= 1e-9 * extent**2:
         raise InputError(
             f"{name}: nothing is left after cleaning but {len(faces)} faces without area, whose corners lie on"
-            " lines. Export the mesh again."
+            f" lines (first at {_place(vertices[faces[0]].mean(axis=0))}). Export the mesh again."
         )
 
 
