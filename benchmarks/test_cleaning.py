@@ -48,8 +48,9 @@ def test_four_times_the_parts_take_four_times_as_long(benchmark, kind):
             taken.append(time.perf_counter() - start)
             assert len(faces) == 12 * count
     ratio = min(seconds[many]) / (4 * min(seconds[few]))
-    print(
-        f"\n{kind}: {few} {min(seconds[few]):.2f} s, {many} {min(seconds[many]):.2f} s, ratio {ratio:.2f}"
+    print(  # noqa: T201
+        f"\n{kind}: {few} in {min(seconds[few]):.2f} s, {many} in {min(seconds[many]):.2f} s,"
+        f" ratio {ratio:.2f}"
     )
     benchmark.extra_info.update(parts=many, ratio=ratio, turned=repairs["turned_faces"])
     benchmark.pedantic(clean, args=mesh(few), rounds=1)

@@ -1,18 +1,20 @@
 """Which faces of a mesh are neighbours, also where more than two meet at an edge.
 
-A pairing of half-edges decides everything else: parts are what it connects, and each fan of faces that it connects around a
-position gets a vertex of its own. What it leaves unpaired is a boundary. So cutting along an edge, keeping parts that touch
-apart, and parting the fans of a vertex are one operation (Guéziec, Taubin, Lazarus and Horn, *Cutting and stitching: converting
-sets of polygons to manifold surfaces*, TVCG 2001, whose local cuts these are).
+A pairing of half-edges decides everything else. Parts are what it connects. Each fan of faces that
+it connects around a position gets a vertex of its own. What it leaves unpaired is a boundary. So
+cutting along an edge, keeping apart what only touches, and splitting a vertex are one operation.
+These are the local cuts of A. Guéziec, G. Taubin, F. Lazarus and B. Horn, *Cutting and stitching:
+converting sets of polygons to manifold surfaces*, TVCG 2001; how faces are paired is our own.
 
-Half-edge ``3 f + k`` leaves corner k of face f. An edge is where half-edges run between the same two positions; its faces are
-paired
+Half-edge ``3 f + k`` leaves corner k of face f. An edge is where half-edges run between the same
+two positions. Its faces are paired
 
 1. if there are two of them;
-2. if two of them share the edge's two *vertices in the file* and no other face does;
-3. if directions alternate around the edge, as they do where solids touch: the two faces that bound one piece of inside;
-4. else of opposite directions, best first: faces connected elsewhere, then faces whose parts have no boundary elsewhere, then
-   the pair that continues most nearly straight on.
+2. if two of them, and no third, share the edge's two *vertices in the file*;
+3. if directions alternate around the edge, as they do where solids touch: the two faces that bound
+   one piece of inside;
+4. else by opposite directions, best first: faces that are connected elsewhere, then faces of pieces
+   without boundary, then the two that continue most nearly straight on.
 """
 
 import numpy as np
@@ -39,8 +41,8 @@ def pair_half_edges(vertices, faces, alias):
     opposite : (3 m,) int32
         The other half-edge of the pair, -1 on a boundary.
     sense : (m,) int8
-        -1 for faces to be turned, so that the two half-edges of each pair run in opposite directions; most of the area of
-        the faces that rules 1 and 2 connect keeps its own.
+        -1 for faces to be turned, so that the two half-edges of each pair run in opposite
+        directions. Most of the area that rules 1 and 2 connect keeps its own direction.
     crowded : int
         Edges of more than two faces.
     cut : int
@@ -52,14 +54,14 @@ def pair_half_edges(vertices, faces, alias):
     join_twos(opposite, *edge)
     crowded = np.flatnonzero(counts[run] > 2)
     left, number = _join_by_file(opposite, order[crowded], run[crowded], *sides(alias))
-    sense, patch, cut = _orient_patches(vertices, faces, opposite, start)
+    sense, piece, cut = _orient_pieces(vertices, faces, opposite, start)
     if len(left):
         undecided = np.zeros(faces.size, bool)
         undecided[left] = True
-        rim = np.zeros(patch.max() + 1, bool)
-        rim[patch[np.flatnonzero((opposite < 0) & ~undecided) // 3]] = True
+        rim = np.zeros(piece.max() + 1, bool)
+        rim[piece[np.flatnonzero((opposite < 0) & ~undecided) // 3]] = True
         facing = _facing(vertices, faces, sense, order, run)
-        _match_crowded(vertices, faces, opposite, left, number, sense, patch, rim, facing)
+        _match_crowded(vertices, faces, opposite, left, number, sense, piece, rim, facing)
     return opposite, sense, int((counts > 2).sum()), cut
 
 
@@ -75,7 +77,10 @@ def undirected(a, b):
 
 
 def runs(keys):
-    """An order that puts equal keys side by side, the run that each of it belongs to, and the lengths of runs."""
+    """Put equal keys side by side.
+
+    Returns their order, the run that each of the ordered keys belongs to, and the lengths of runs.
+    """
     order = np.argsort(keys, kind="stable")
     new = np.r_[True, np.diff(keys[order]) != 0][: len(keys)]
     run = np.cumsum(new) - 1
@@ -90,7 +95,7 @@ def join_twos(opposite, order, run, counts):
 
 
 def _join_by_file(opposite, order, run, start, end):
-    """Rule 2, and rule 1 again for the rest; returns what is still undecided, as `order` and `run`."""
+    """Rule 2, then rule 1 for the rest; returns what is left, as `order` and `run`."""
     if not len(order):
         return order, run
     key = undirected(start[order], end[order])
@@ -107,7 +112,10 @@ def _join_by_file(opposite, order, run, start, end):
 
 
 def _facing(vertices, faces, sense, order, run):
-    """-1 for faces of clusters that are inside out, else 1; a cluster is what edges connect, however many faces they have."""
+    """-1 for faces of clusters that are inside out, else 1.
+
+    A cluster is what edges connect, however many faces they have.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -120,7 +128,7 @@ def _facing(vertices, faces, sense, order, run):
 
 
 def signed_volumes(vertices, faces, part, count, sense):
-    """Six times the volume of each part, (count,), about its own middle; positive if it is seen from outside."""
+    """Six times the volume of each part, (count,), about its middle; positive if it faces out."""
     corners = vertices[faces]
     size = np.maximum(np.bincount(part, minlength=count), 1)
     middle = [np.bincount(part, corners[..., x].mean(axis=1), count) / size for x in range(3)]
@@ -128,21 +136,21 @@ def signed_volumes(vertices, faces, part, count, sense):
     return np.bincount(part, sense * np.einsum("fx,fx->f", a, np.cross(b, c)), count)
 
 
-def _orient_patches(vertices, faces, opposite, start):
+def _orient_pieces(vertices, faces, opposite, start):
     """Spread orientation over pairs; where it disagrees with itself, unpair.
 
-    Returns the sense (m,) int8, the patch of each face (m,) int32, and the number of unpaired edges.
+    Returns the sense (m,) int8, the piece of each face (m,) int32, and how many edges it unpaired.
     """
     paired = np.flatnonzero(opposite >= 0)
     agree = np.ones(len(opposite), bool)
     agree[paired] = start[paired] != start[opposite[paired]]
     if agree.all():
         return np.ones(len(faces), np.int8), components(opposite)[1], 0
-    sense, patch = np.zeros(len(faces), np.int8), np.empty(len(faces), np.int32)
-    cut = _spread(opposite, agree, sense, patch)
-    weight = np.bincount(patch, sense * areas(vertices, faces))
-    sense[weight[patch] < 0] *= -1
-    return sense, patch, cut
+    sense, piece = np.zeros(len(faces), np.int8), np.empty(len(faces), np.int32)
+    cut = _spread(opposite, agree, sense, piece)
+    weight = np.bincount(piece, sense * areas(vertices, faces))
+    sense[weight[piece] < 0] *= -1
+    return sense, piece, cut
 
 
 def components(opposite):
@@ -157,7 +165,10 @@ def components(opposite):
 
 
 def closed_parts(opposite):
-    """Which faces belong to parts without boundary, (m,) bool; the part of each face, (m,) int32, and their number."""
+    """Which faces belong to parts without boundary, (m,) bool.
+
+    Returns also the part of each face, (m,) int32, and the number of parts.
+    """
     count, part = components(opposite)
     whole = np.ones(count, bool)
     whole[part[np.flatnonzero(opposite < 0) // 3]] = False
@@ -170,7 +181,7 @@ def areas(vertices, faces):
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _match_crowded(vertices, faces, opposite, order, run, sense, patch, rim, facing):
+def _match_crowded(vertices, faces, opposite, order, run, sense, piece, rim, facing):
     """Rules 3 and 4, for half-edges `order` that lie edge by edge, as `run` counts."""
     starts = np.flatnonzero(np.r_[True, np.diff(run) != 0])
     size = np.diff(np.r_[starts, len(run)])
@@ -187,17 +198,21 @@ def _match_crowded(vertices, faces, opposite, order, run, sense, patch, rim, fac
     angle = np.arctan2(np.einsum("hx,hx->h", arm, up), np.einsum("hx,hx->h", arm, right))
     angle %= 2 * np.pi
     angle[angle > 2 * np.pi - _SAME_ANGLE] = 0
-    # counter-clockwise around the axis, the inside ends at a face that runs along it, unless the file is inside out
+    # Counter-clockwise around the axis, the inside ends at a face that runs along the axis, unless
+    # the file is inside out.
     ends = (tail == low) == (sense * facing > 0)[face]
     within = np.lexsort((order, angle, run))
     _match(
-        opposite, order[within], starts, angle[within], ends[within], patch[face[within]], rim
+        opposite, order[within], starts, angle[within], ends[within], piece[face[within]], rim
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _spread(opposite, agree, sense, patch):
-    """Breadth-first, face by face; fill `sense` and `patch`, clear pairs that contradict them and count these."""
+def _spread(opposite, agree, sense, piece):
+    """Breadth-first traversal of faces, which fills `sense` and `piece`.
+
+    Pairs that contradict them are cleared, and counted.
+    """
     m = len(sense)
     queue = np.empty(m, np.int32)
     found = 0
@@ -206,7 +221,7 @@ def _spread(opposite, agree, sense, patch):
         if sense[root] != 0:
             continue
         sense[root] = 1
-        patch[root] = found
+        piece[root] = found
         queue[0] = root
         read, write = 0, 1
         while read < write:
@@ -220,7 +235,7 @@ def _spread(opposite, agree, sense, patch):
                 other = g // 3
                 if sense[other] == 0:
                     sense[other] = wanted
-                    patch[other] = found
+                    piece[other] = found
                     queue[write] = other
                     write += 1
                 elif sense[other] != wanted:
@@ -232,7 +247,7 @@ def _spread(opposite, agree, sense, patch):
 
 
 @njit(cache=True, nogil=True)
-def _match(opposite, order, starts, angle, ends, patch, rim):
+def _match(opposite, order, starts, angle, ends, piece, rim):
     """Pair the half-edges of each edge, which are sorted by angle around it."""
     n = len(order)
     for i in range(len(starts)):
@@ -249,7 +264,7 @@ def _match(opposite, order, starts, angle, ends, patch, rim):
                 if not ends[ring[k]]:
                     _join(opposite, order, ring[k], ring[(k + 1) % size])
         elif size <= _MOST_COMPARED:
-            _match_by_score(opposite, order, first, last, angle, ends, patch, rim)
+            _match_by_score(opposite, order, first, last, angle, ends, piece, rim)
         else:
             _match_nested(opposite, order, ring, ends)
 
@@ -262,43 +277,30 @@ def _join(opposite, order, a, b):
 
 @njit(cache=True, nogil=True)
 def _alternated(angle, ends):
-    """The order around an edge, where faces that lie on each other are put in turns of ending and beginning."""
+    """The order around an edge; faces that lie on each other end and begin the inside by turns."""
     n = len(angle)
-    # start behind a gap, at a face that lies alone where there is one
-    begin = 0
-    for k in range(n):
-        gap = k == 0 or angle[k] - angle[k - 1] > _SAME_ANGLE
-        if gap and (k + 1 == n or angle[k + 1] - angle[k] > _SAME_ANGLE):
-            begin = k
-            break
     ring = np.empty(n, np.int64)
     used = np.zeros(n, np.bool_)
     before = False
-    k = 0
-    while k < n:
-        # the faces that lie on this one
-        size = 1
-        here = (begin + k) % n
-        while k + size < n:
-            following = (begin + k + size) % n
-            if following == 0 or angle[following] - angle[following - 1] > _SAME_ANGLE:
-                break
-            size += 1
-        for _ in range(size):
+    first = 0
+    while first < n:
+        last = first + 1
+        while last < n and angle[last] - angle[last - 1] <= _SAME_ANGLE:
+            last += 1
+        for k in range(first, last):
             pick = -1
-            for j in range(size):
-                at = (here + j) % n
+            for at in range(first, last):
                 if not used[at] and (pick < 0 or (ends[pick] == before and ends[at] != before)):
                     pick = at
             used[pick] = True
             before = ends[pick]
             ring[k] = pick
-            k += 1
+        first = last
     return ring
 
 
 @njit(cache=True, nogil=True)
-def _match_by_score(opposite, order, first, last, angle, ends, patch, rim):
+def _match_by_score(opposite, order, first, last, angle, ends, piece, rim):
     while True:
         best, one, two = np.inf, -1, -1
         for a in range(first, last):
@@ -308,9 +310,9 @@ def _match_by_score(opposite, order, first, last, angle, ends, patch, rim):
                 if opposite[order[b]] >= 0 or ends[a] == ends[b]:
                     continue
                 score = abs(abs(angle[a] - angle[b]) - np.pi)
-                if rim[patch[a]] or rim[patch[b]]:
+                if rim[piece[a]] or rim[piece[b]]:
                     score += 10
-                if patch[a] != patch[b]:
+                if piece[a] != piece[b]:
                     score += 20
                 if score < best - _SAME_ANGLE:
                     best, one, two = score, a, b

@@ -1,7 +1,7 @@
-"""Bring a raw mesh into a state that can be dressed, and say what was done.
+"""Make an oriented manifold of a raw mesh, and say what was done.
 
-What a mesh is made of is decided by `_pairing`; here is what comes before it (one vertex a position, no face twice) and after it
-(which way parts face, vertices of their own for parts that touch).
+`_pairing` decides which faces are neighbours. Here is what comes before it (one vertex for each
+position, no face twice) and after it (which way parts face, vertices for parts that touch).
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ from btfpipe.surface.surface import require_extent
 
 MERGE_DISTANCE = 1e-7  # of the bounding box's diagonal
 _WELD = (
-    "Weld them first: Merge Close Vertices in MeshLab (meshing_merge_close_vertices in pymeshlab), Merge by Distance in"
-    " Blender (bpy.ops.mesh.remove_doubles)."
+    "Weld them first: Merge Close Vertices in MeshLab (meshing_merge_close_vertices in pymeshlab),"
+    " Merge by Distance in Blender (bpy.ops.mesh.remove_doubles)."
 )
 _TINY = np.finfo(float).tiny
 _OFF_SURFACE = 1e-4  # of the root of a face's area: from where it is asked what a part lies in
@@ -22,9 +22,10 @@ _OFF_SURFACE = 1e-4  # of the root of a face's area: from where it is asked what
 def clean(vertices, faces, name="mesh"):
     """Make an oriented manifold, with or without boundary, of a mesh.
 
-    Parts that are connected in the file, and closed, stay what they are where they touch others. Everything else is welded by
-    position. Where more than two faces meet at an edge, solids come apart as solids, and a third face (a fin, an inner wall)
-    becomes a part of its own with a boundary. A one-sided surface is cut, because no field of frames goes around it.
+    A part that is closed in the file's own indices stays as it is where it touches another. All
+    else is welded by position. Where more than two faces meet at an edge, solids come apart as solids,
+    and a third face (a fin, an inner wall) becomes a part of its own with a boundary. A one-sided
+    surface is cut, because no field of frames goes around it.
 
     Parameters
     ----------
@@ -37,20 +38,23 @@ def clean(vertices, faces, name="mesh"):
     -------
     vertices : (n', 3) float64
     faces : (m', 3) int32
-        Closed parts are seen counter-clockwise from outside; a cavity, which is a closed part inside another one that the file
-        turns the opposite way, from inside itself. Open parts face as most of their area did.
+        Counter-clockwise seen from outside, for closed parts. A closed part inside another one that
+        the file turns the opposite way is a cavity, and faces what is in it. Open parts face as
+        most of their area did.
     repairs : dict of str to int
-        What was done how often: ``unreferenced_vertices`` left out, ``merged_vertices`` (that shared the position of another),
-        ``degenerate_faces`` (two corners in one position), ``duplicate_faces`` (faces there twice) and ``double_sided_faces``
-        (there twice in opposite directions, of which one stays: what is open is rendered from both sides) left out,
-        ``parted_edges`` (of more than two faces), ``cut_edges`` (of a one-sided surface), ``turned_faces``,
-        ``split_vertices`` (made where fans or parts touch), ``bisected_edges`` (two edges between the same two vertices).
+        What was done how often. Left out: ``unreferenced_vertices``; ``degenerate_faces`` with two
+        corners in one position; ``duplicate_faces``; ``double_sided_faces``, the backs of what is
+        there twice in opposite directions (open parts are rendered from both sides).
+        Joined: ``merged_vertices``, which shared the position of another. Parted: ``parted_edges``
+        of more than two faces, ``cut_edges`` of a one-sided surface, ``split_vertices`` made where
+        fans or parts touch. Changed: ``turned_faces``; ``bisected_edges``, of which two ran between
+        the same two vertices.
 
     Raises
     ------
     InputError
-        If a used vertex is not finite, or lengths are beyond `require_extent`; if nothing with an area is left, or most faces
-        share no edge with another.
+        If a used vertex is not finite, or lengths are beyond `require_extent`; if nothing with an
+        area is left, or most faces share no edge with another.
     """
     repairs = {}
     used = np.zeros(len(vertices), bool)
@@ -60,13 +64,13 @@ def clean(vertices, faces, name="mesh"):
     if (points != points[:1]).any():  # what lies in one place is refused below
         require_extent(points, name)
     alias = (np.cumsum(used) - 1)[faces]
-    place = _places(points)
-    faces = place[alias]
+    position = _positions(points)
+    faces = position[alias]
     proper = _proper(faces)
     alias = _united(alias, faces, proper, len(points))[proper]
     repairs["degenerate_faces"] = int((~proper).sum())
-    first, faces = _in_order_of_file(place, faces[proper])
-    met = np.isin(place, place[first])
+    first, faces = _in_order_of_file(position, faces[proper])
+    met = np.isin(position, position[first])
     repairs["unreferenced_vertices"] = len(vertices) - int(met.sum())
     repairs["merged_vertices"] = int(met.sum()) - len(first)
     vertices = points[first]
@@ -87,14 +91,14 @@ def _check_finite(vertices, used, name):
     bad = np.flatnonzero(used & ~np.isfinite(vertices).all(axis=1))
     if len(bad):
         raise InputError(
-            f"{name}: {len(bad)} of {int(used.sum())} vertices are not finite (first: vertex {bad[0]},"
-            f" counted from 0, {_place(vertices[bad[0]])}). Remove their faces (remove_infinite_values of trimesh) or export the"
-            " mesh again."
+            f"{name}: {len(bad)} of {int(used.sum())} vertices are not finite (first: vertex"
+            f" {bad[0]}, counted from 0, {_place(vertices[bad[0]])}). Remove their faces"
+            " (remove_infinite_values of trimesh) or export the mesh again."
         )
 
 
-def _places(points):
-    """The position of each point, (n,) int64, counted in any order; points closer than a hair share theirs."""
+def _positions(points):
+    """A number for the position of each point, (n,); points closer than a hair share theirs."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -121,7 +125,7 @@ def _proper(faces):
 
 
 def _united(alias, faces, proper, n):
-    """Corners as vertices of the file, those being one that a face without area connects at one position.
+    """Corners as vertices of the file; a face without area makes one of those at one position.
 
     Otherwise the neighbours of such a face, which is left out, would not be connected.
     """
@@ -137,15 +141,15 @@ def _united(alias, faces, proper, n):
     return connected_components(graph, directed=False)[1][alias]
 
 
-def _in_order_of_file(place, faces):
+def _in_order_of_file(position, faces):
     """The first point at each position that faces use, and faces that count these."""
-    wanted = np.zeros(place.max(initial=0) + 1, bool)
+    wanted = np.zeros(position.max(initial=0) + 1, bool)
     wanted[faces] = True
-    points = np.flatnonzero(wanted[place])
-    first = np.full(len(wanted), len(place))
-    np.minimum.at(first, place[points], points)
+    points = np.flatnonzero(wanted[position])
+    first = np.full(len(wanted), len(position))
+    np.minimum.at(first, position[points], points)
     chosen = np.sort(first[wanted])
-    rank = np.empty(len(place) + 1, np.int32)
+    rank = np.empty(len(position) + 1, np.int32)
     rank[chosen] = np.arange(len(chosen), dtype=np.int32)
     return chosen, rank[first][faces].reshape(-1, 3)
 
@@ -219,8 +223,8 @@ def _pair(vertices, faces, alias, repairs):
 def _doubled(faces, opposite):
     """Faces that lie on another one and are not needed, and which of them turn the other way.
 
-    Where closed parts touch, both keep their faces. A face of an open part is not needed, nor is one of a closed part that
-    covers another part, or itself, wholly.
+    Where closed parts touch, both keep their faces. A face of an open part is not needed, nor is
+    one of a closed part that covers another part, or itself, wholly.
     """
     nothing = np.zeros(0, np.int64), np.zeros(0, bool)
     triple = _triples(faces)
@@ -265,8 +269,9 @@ def _check_area(vertices, faces, name):
     extent = np.ptp(vertices, axis=0).max(initial=0)
     if _pairing.areas(vertices, faces).sum() <= 1e-9 * extent**2:
         raise InputError(
-            f"{name}: nothing is left after cleaning but {len(faces)} faces without area, whose corners lie on"
-            f" lines (first at {_place(vertices[faces[0]].mean(axis=0))}). Export the mesh again."
+            f"{name}: nothing is left after cleaning but {len(faces)} faces without area, whose"
+            f" corners lie on lines (first at {_place(vertices[faces[0]].mean(axis=0))}). Export the"
+            " mesh again."
         )
 
 
@@ -280,8 +285,8 @@ def _check_connected(vertices, faces, name):
     if len(faces) > 1 and len(alone) > len(faces) / 2:
         where = _place(vertices[faces[alone[0]]].mean(axis=0))
         raise InputError(
-            f"{name}: {len(alone)} of {len(faces)} faces share no edge with another (first at {where}): loose triangles,"
-            f" not a surface. {_WELD}"
+            f"{name}: {len(alone)} of {len(faces)} faces share no edge with another (first at"
+            f" {where}): loose triangles, not a surface. {_WELD}"
         )
 
 
@@ -299,7 +304,7 @@ def _manifold(vertices, faces, opposite, sense, repairs):
 
 
 def _facing_out(vertices, faces, opposite, sense):
-    """The sense of faces with closed parts facing outward, cavities inward, and open parts as most of their area did."""
+    """The sense of faces when closed parts face out, cavities in, open parts as most of them."""
     closed, part, count = _pairing.closed_parts(opposite)
     volume = _pairing.signed_volumes(vertices, faces, part, count, sense)
     area = np.bincount(part, sense * _pairing.areas(vertices, faces), count)
@@ -315,7 +320,10 @@ def _facing_out(vertices, faces, opposite, sense):
 
 
 def _in_the_opposite(vertices, faces, part, sense, closed, inward):
-    """Which closed parts lie in closed parts that the file turns the opposite way; `inward` says how it turns each."""
+    """Which closed parts lie in others that the file turns the opposite way, as `inward` says.
+
+    Asked of winding numbers (Jacobson, Kavan and Sorkine-Hornung 2013) beside the largest face.
+    """
     import igl
 
     whole = np.unique(part[closed])
@@ -328,7 +336,7 @@ def _in_the_opposite(vertices, faces, part, sense, closed, inward):
     step = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY) ** 0.5
     middle, step = (a + b + c) / 3, _OFF_SURFACE * step
     turned = np.where(inward[part][:, None], outward[:, ::-1], outward)[closed]
-    # Asked on both sides of the part's own face: what only touches it from outside, or from inside, is on one side only.
+    # What only touches the face, from outside or from inside, is on one side of it only.
     own = np.where(inward[whole], -1, 1)
     outside, inside = (
         np.round(igl.fast_winding_number(vertices, turned.astype(np.int64), middle + way * step))
@@ -378,7 +386,7 @@ def _part_fans(vertices, faces, opposite):
 
 
 def _bisect(vertices, faces, opposite):
-    """Halve edges until no two run between the same two vertices, which corners alone could not tell apart."""
+    """Halve edges until no two run between the same two vertices, where corners look alike."""
     made = 0
     while True:
         again = _repeated_edges(faces, opposite)
@@ -418,7 +426,7 @@ def _halved(vertices, faces, opposite, h):
     middle = np.r_[middle, middle[both]]
     f, k = split // 3, split % 3
     second, third = (k + 1) % 3, (k + 2) % 3
-    # (a, b, c) becomes (a, middle, c), in its place, and (middle, b, c)
+    # (a, b, c) becomes (a, middle, c), in its position, and (middle, b, c)
     new = len(faces) + np.arange(len(split))
     more = np.stack([middle, faces[f, second], faces[f, third]], 1)
     faces = faces.copy()

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def faults(vertices, faces):
-    """What keeps a triangle mesh from being an oriented manifold with or without boundary, as a list of sentences."""
+    """What keeps a triangle mesh from being an oriented manifold (with or without boundary)."""
     found = []
     faces = [tuple(int(c) for c in face) for face in faces]
     used = {c for face in faces for c in face}

@@ -59,7 +59,7 @@ def box(shapes, *size):
 
 
 def even_cube():
-    """A unit cube whose opposite sides are divided alike, so that neighbours have the same triangles where they touch."""
+    """A unit cube whose opposite sides are divided alike: neighbours share whole triangles."""
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return corners, np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))])
@@ -221,7 +221,7 @@ def test_of_two_cubes_that_share_an_edge_one_may_be_inside_out(shapes):
 
 
 def with_slit(vertices, faces, a, b):
-    """The same, one face at the edge from a to b having a copy of a, and faces without area in the slit."""
+    """The same with a copy of corner a in one face, and faces without area in the slit."""
     n = len(vertices)
     here = int(np.flatnonzero((faces == a).any(1) & (faces == b).any(1))[0])
     others = [c for c in faces[here] if c not in (a, b)]
@@ -271,7 +271,7 @@ def test_solids_of_cubes_have_the_parts_and_holes_that_digital_topology_counts(s
 
 
 def _digital_euler(solid):
-    """Cubes - pairs + squares of four - blocks of eight: the Euler characteristic of cubes connected by faces."""
+    """Euler characteristic of cubes that faces connect: cubes - pairs + fours - eights."""
     total = 0
     for spread in np.ndindex(2, 2, 2):
         block = np.pad(solid, 1)
@@ -282,7 +282,7 @@ def _digital_euler(solid):
 
 
 def test_an_edge_whose_ends_stay_connected_is_halved(shapes):
-    """Two blocks meet in an edge between a floor and a ceiling: two edges would join the same two vertices."""
+    """Two blocks meet in an edge between a floor and a ceiling, which keep its ends connected."""
     solid = np.ones((4, 4, 3), bool)
     solid[1:3, 1:3, 1] = [[True, False], [False, True]]
     solid[0] = solid[3] = solid[:, 0] = solid[:, 3] = False
@@ -301,7 +301,7 @@ def fin_outside(shapes):
 
 
 def flange(shapes):
-    """A square frame in the plane of a cube's top, around it: straight on, but the cube is what is closed."""
+    """A square frame around a cube's top: it goes straight on, but the cube is what is closed."""
     vertices, faces = box(shapes, 1, 1, 1)
     top = np.array([(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], float)
     outer = (top - (0.5, 0.5, 1)) * 3 + (0.5, 0.5, 1)
