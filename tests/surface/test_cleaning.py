@@ -342,6 +342,18 @@ def test_a_third_face_at_an_edge_becomes_a_part_with_a_boundary(
     assert area(vertices, faces) == pytest.approx(whole)
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_what_meets_on_a_closed_part_s_edge_is_joined_as_if_it_were_not_there(shapes, turn):
+    edge = [(1, 1, 0), (1, 1, 1)]
+    one = np.array([*edge, (3, 1, 0.5)], float), np.array([(0, 1, 2)])
+    two = np.array([*edge, (1, 3, 0.5)], float), np.array([(0, 1, 2)[::turn]])
+    _, faces, repairs = cleaned(*joined(box(shapes, 1, 1, 1), one, two))
+    assert repairs["parted_edges"] == 1
+    assert repairs["turned_faces"] == (turn > 0)
+    assert euler_characteristics(faces) == [1, 2]
+    assert boundary_edges(faces) == 4
+
+
 def test_sheets_that_cross_come_apart_flat(shapes):
     sheet = shapes.grid(3, 3, 1, 1)
     upright = sheet[0][:, [1, 0, 2]] + (0.5, -0.5, 0), sheet[1]
