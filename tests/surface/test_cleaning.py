@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from shared_manifold import boundary_edges, euler_characteristics, faults
 
 from btfpipe.errors import InputError
+from btfpipe.surface import cleaning
 from btfpipe.surface.cleaning import clean
 from btfpipe.surface.topology import describe, opposite_half_edges
 
@@ -291,6 +292,21 @@ def test_an_edge_whose_ends_stay_connected_is_halved(shapes):
     assert repairs["bisected_edges"] == 1
     assert volume(vertices, faces) == pytest.approx(solid.sum())
     assert euler_characteristics(faces) == [0]  # two blocks between two plates: a ring
+
+
+def test_halved_edges_keep_the_pairing_that_corners_tell(shapes, rng):
+    vertices, faces = shapes.grid()
+    opposite = opposite_half_edges(faces)
+    for _ in range(3):
+        some = rng.permutation(len(opposite))[:200]
+        some = some[(opposite[some] < 0) | (opposite[some] > some)]
+        some = cleaning._apart(np.sort(some), opposite, len(faces))
+        count, whole = len(vertices), area(vertices, faces)
+        vertices, faces, opposite = cleaning._halved(vertices, faces, opposite, some)
+        assert len(vertices) == count + len(some) > count
+        np.testing.assert_array_equal(opposite, opposite_half_edges(faces))
+        assert area(vertices, faces) == pytest.approx(whole)
+        assert not faults(vertices, faces)
 
 
 def fin_outside(shapes):
