@@ -27,7 +27,11 @@ class Deviation:
     from_input, to_input : (k,) float64
         Of points on the input to the mesh, and of points on the mesh to the input.
     points : (k, 3) float64
-        The points on the input, then those on the mesh.
+        The points on the input; of points on the mesh the closest on the input.
+    place : (k,) int64
+        Faces of the input that hold them.
+    face : (k,) int64
+        Faces of the mesh that they are closest to.
     mean_from_input, mean_to_input : float
         Means over the area.
     area_ratio : float
@@ -37,9 +41,16 @@ class Deviation:
     from_input: np.ndarray
     to_input: np.ndarray
     points: np.ndarray
+    place: np.ndarray
+    face: np.ndarray
     mean_from_input: float
     mean_to_input: float
     area_ratio: float
+
+    @property
+    def distances(self):
+        """Both, from the input first, in the order of `points`."""
+        return np.concatenate([self.from_input, self.to_input])
 
     def summary(self, spacing, extent):
         """The largest and the mean distances, in the mesh's unit, in spacings and as a fraction of the extent."""
@@ -81,38 +92,45 @@ def measure(vertices, faces, source_vertices, source_faces, spacing, seed=0):
     -------
     Deviation
     """
-    on_edges = _along_edges(source_vertices, source_faces, spacing / 2)
-    inside = _on_faces(source_vertices, source_faces, 4 * len(vertices), seed)
-    from_edges = distances(np.concatenate([source_vertices, on_edges]), vertices, faces)
-    from_inside = distances(inside, vertices, faces)
+    start, end = half_edges(source_faces)
+    first = np.empty(len(source_vertices), np.int64)
+    first[start] = np.arange(len(start)) // 3
+    on_edges, edge = _along_edges(source_vertices, source_faces, spacing / 2)
+    inside, face = _on_faces(source_vertices, source_faces, 4 * len(vertices), seed)
+    theirs = np.concatenate([source_vertices, on_edges, inside])
+    from_input, nearest, _ = closest(theirs, vertices, faces)
     corners = vertices[faces]
-    middles = corners.mean(axis=1)
     h = _bent(vertices, faces)
     start, end = half_edges(faces)
-    ridges = np.concatenate([vertices, 0.5 * (vertices[start[h]] + vertices[end[h]])])
-    from_middles = distances(middles, source_vertices, source_faces)
-    from_ridges = distances(ridges, source_vertices, source_faces)
+    ours = np.concatenate(
+        [corners.mean(axis=1), 0.5 * (vertices[start[h]] + vertices[end[h]]), vertices]
+    )
+    around = np.empty(len(vertices), np.int64)
+    around[start] = np.arange(len(start)) // 3
+    to_input, place, on_input = closest(ours, source_vertices, source_faces)
     twice = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     return Deviation(
-        np.concatenate([from_edges, from_inside]),
-        np.concatenate([from_middles, from_ridges]),
-        np.concatenate([source_vertices, on_edges, inside, middles, ridges]),
-        float(from_inside.mean()),
-        float(np.average(from_middles, weights=twice)),
+        from_input,
+        to_input,
+        np.concatenate([theirs, on_input]),
+        np.concatenate([first, edge // 3, face, place]),
+        np.concatenate([nearest, np.arange(len(faces)), h // 3, around]),
+        float(from_input[-len(inside) :].mean()),
+        float(np.average(to_input[: len(faces)], weights=twice)),
         mesh_area(vertices, faces) / mesh_area(source_vertices, source_faces),
     )
 
 
-def distances(points, vertices, faces):
-    """Distance of each point (k, 3) to a mesh, (k,) float64."""
+def closest(points, vertices, faces):
+    """Distance (k,), face (k,) and place (k, 3) of the point of a mesh that is closest to each point (k, 3)."""
     import igl
 
-    squared, _, _ = igl.point_mesh_squared_distance(
+    squared, face, place = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points), np.ascontiguousarray(vertices), faces.astype(np.int64)
     )
-    return np.sqrt(np.maximum(squared, 0))
+    return np.sqrt(np.maximum(squared, 0)), face, place
 
 
 def farthest_beyond(deviation, spacing, tips):
@@ -131,7 +149,7 @@ def farthest_beyond(deviation, spacing, tips):
     """
     from scipy.spatial import cKDTree
 
-    distance = np.concatenate([deviation.from_input, deviation.to_input])
+    distance = deviation.distances
     off = np.flatnonzero(distance > MOST_SPACINGS * spacing)
     if len(off) and len(tips):
         gap, _ = cKDTree(tips).query(deviation.points[off])
@@ -159,26 +177,28 @@ def sharp_tips(vertices, faces, spacing):
     # a cone that opens by an angle a unrolls to 2 pi sin(a / 2)
     tip = around < 2 * np.pi * np.sin(np.deg2rad(TIP_DEG) / 2)
     a, b = vertices[start[knife]], vertices[end[knife]]
-    return np.concatenate([vertices[tip], a, b, _between(a, b, spacing)])
+    return np.concatenate([vertices[tip], a, b, _between(a, b, spacing)[0]])
 
 
 def _between(a, b, step):
-    """Points between the ends of edges, at most `step` apart, without the ends."""
+    """Points between the ends of edges, at most `step` apart, without the ends; and the edge of each."""
     parts = np.ceil(np.linalg.norm(b - a, axis=1) / step).astype(int).clip(1, _MOST_PARTS)
     edge = np.repeat(np.arange(len(a)), parts - 1)
     first = np.cumsum(parts - 1) - (parts - 1)
     fraction = ((np.arange(len(edge)) - first[edge] + 1) / parts[edge])[:, None]
-    return (1 - fraction) * a[edge] + fraction * b[edge]
+    return (1 - fraction) * a[edge] + fraction * b[edge], edge
 
 
 def _along_edges(vertices, faces, step):
+    """Points along the edges of a mesh and the half-edge of each."""
     start, end = half_edges(faces)
-    once = np.arange(len(start)) > opposite_half_edges(faces)
-    return _between(vertices[start[once]], vertices[end[once]], step)
+    once = np.flatnonzero(np.arange(len(start)) > opposite_half_edges(faces))
+    points, edge = _between(vertices[start[once]], vertices[end[once]], step)
+    return points, once[edge]
 
 
 def _on_faces(vertices, faces, count, seed):
-    """Random points, as many a unit of area everywhere, (count, 3)."""
+    """Random points, as many a unit of area everywhere, (count, 3), and the face of each."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     share = np.cumsum(np.linalg.norm(across, axis=1))
@@ -187,7 +207,7 @@ def _on_faces(vertices, faces, count, seed):
     face = np.minimum(np.searchsorted(share, even * share[-1]), len(faces) - 1)
     r, s = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
-    return np.einsum("kc,kcx->kx", weights, corners[face])
+    return np.einsum("kc,kcx->kx", weights, corners[face]), face
 
 
 def _bent(vertices, faces):
@@ -195,8 +215,7 @@ def _bent(vertices, faces):
     opposite = opposite_half_edges(faces)
     angle = edge_normals_angle(vertices, faces, opposite)
     return np.flatnonzero(
-        (opposite < 0)
-        | ((angle > np.deg2rad(_BENT_DEG)) & (np.arange(len(opposite)) > opposite))
+        (opposite < 0) | ((angle > np.deg2rad(_BENT_DEG)) & (np.arange(len(opposite)) > opposite))
     )
 
 

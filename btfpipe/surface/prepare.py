@@ -21,7 +21,7 @@ from btfpipe.surface.pyramid import parents
 from btfpipe.surface.remeshing import resample
 from btfpipe.surface.smooth_input import PHONG_ALPHA, smooth_input
 from btfpipe.surface.surface import Level, Surface
-from btfpipe.surface.topology import describe, edge_lengths, mean_edge, mesh_area
+from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 _TOLERANCE = 0.05
 _MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
@@ -100,20 +100,17 @@ def prepare(
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
         with naming(name):
-            fine, place, weights = resample(
+            made = resample(
                 source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
             )
-            flat = source.flat(place, weights)
-            spacing = mean_edge(flat, fine)
-            off = measure(flat, fine, vertices, faces, spacing)
+        fine, place, weights = made
+        off = made.deviation
         if i == 0:
-            problem = _problem(source, flat, fine, spacing, off, wanted)
+            problem = _problem(source, made, wanted)
             if problem:
                 raise InputError(_refusal(name, source, wanted, problem, _most_vertices(memory)))
             deviation = off
-        level_distances.append(
-            float(max(off.from_input.max(), off.to_input.max()) / spacing)
-        )
+        level_distances.append(float(off.distances.max() / made.spacing))
         normals = source.normals(place, weights)
         levels.append(
             Level(
@@ -122,8 +119,8 @@ def prepare(
             )
         )  # fmt: skip
         if i == 0 and smooth:
-            moved = np.linalg.norm(levels[0].vertices - flat, axis=1)
-            deviation = measure(levels[0].vertices, fine, vertices, faces, spacing)
+            moved = np.linalg.norm(levels[0].vertices - source.flat(place, weights), axis=1)
+            deviation = measure(levels[0].vertices, fine, vertices, faces, made.spacing)
     fallbacks = []
     for level, coarser in itertools.pairwise(levels):
         level.parent_face, level.parent_weights, missed = parents(
@@ -192,29 +189,16 @@ def _check_memory(name, n_vertices, memory):
         )
 
 
-def _problem(source, flat, faces, spacing, deviation, wanted):
-    """What a resampling without smoothing does wrong, as words, and how many times too wrong; nothing if nothing is.
-
-    Parameters
-    ----------
-    source : SmoothInput
-    flat : (n, 3) float64
-        Vertices on the flat faces of the input.
-    faces : (m, 3) int32
-    spacing : float
-    deviation : Deviation
-    wanted : int
-        Vertices asked for.
-    """
-    found = len(flat)
+def _problem(source, made, wanted):
+    """What a resampling without smoothing does wrong, as words, and how many times too wrong; nothing if nothing is."""
+    spacing, deviation = made.spacing, made.deviation
+    found = len(made.place_face)
     if abs(found - wanted) > _TOLERANCE * wanted:
         return (
             f"{found} is as near as its edges, boundaries and components allow"
             f" ({len(describe(source.faces, len(source.vertices))[0])} components)"
         ), found / wanted
-    beyond = farthest_beyond(
-        deviation, spacing, sharp_tips(source.vertices, source.faces, spacing)
-    )
+    beyond = farthest_beyond(deviation, spacing, sharp_tips(source.vertices, source.faces, spacing))
     if beyond:
         where = ", ".join(f"{x:.4g}" for x in beyond[1])
         return (
@@ -237,11 +221,7 @@ def _refusal(name, source, wanted, problem, most):
     n = wanted
     while n < most:
         n = min(math.ceil(n * min(max(excess, _MORE_VERTICES), _MOST_MORE) / 100) * 100, most)
-        faces, place, weights = resample(source, n)
-        flat = source.flat(place, weights)
-        spacing = mean_edge(flat, faces)
-        off = measure(flat, faces, source.vertices, source.faces, spacing)
-        problem = _problem(source, flat, faces, spacing, off, n)
+        problem = _problem(source, resample(source, n), n)
         if not problem:
             return f"{start} Ask for {n} with --vertices."
         excess = problem[1]
@@ -269,4 +249,3 @@ def _lay_field(levels, strokes, turn):
         tangents = field.unit_field(vectors, level.faces, level.normals, _FIELD_ROUNDS)
         normals = np.asarray(level.normals, np.float64)
         level.tangents = field.turned(tangents, normals, turn).astype(np.float32)
-

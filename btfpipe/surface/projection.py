@@ -4,7 +4,6 @@ A global search for the closest point may land on the other side of a thin wall.
 from a face to its neighbours for as long as that brings it nearer, and it does not cross feature lines.
 """
 
-import numpy as np
 from numba import njit, prange
 
 _MOST_STEPS = 10_000  # faces that one walk may cross; distances fall, so it ends anyway

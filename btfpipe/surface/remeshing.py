@@ -5,18 +5,27 @@ flipped, and vertices moved to the middle of their neighbours within the surface
 Split, collapse and flip are the only changes of connectivity, so components, boundaries and genus stay.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from btfpipe.errors import InputError
 from btfpipe.surface import _edges
+from btfpipe.surface.deviation import Deviation, closest, measure
 from btfpipe.surface.feature_lines import feature_lines
 from btfpipe.surface.projection import walk_faces, walk_lines
-from btfpipe.surface.topology import edge_normals_angle, face_normals, half_edges, mesh_area
+from btfpipe.surface.topology import (
+    edge_normals_angle,
+    face_normals,
+    half_edges,
+    mean_edge,
+    mesh_area,
+)
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
 _MORE_ROUNDS = 6
 _HELD, _LEFT = 0.3, 0.4  # spacings that a point of the input may lie off, on the way and in the end
-_MORE_PINS = 4
+_MOST_MENDS = 8
 _MOST_REVERTS = 3
 _BENT_DEG = 20  # of edges along which points are held
 _MOST_PARTS = 1000
@@ -126,23 +135,23 @@ class _Mesh:
                 self._grow()
             v = self.n_vertices
             self.n_vertices += 1
-            self.n_faces = _edges.insert_vertex(
-                *self._tables(), self.origin, face, v, self.n_faces
-            )
+            self.n_faces = _edges.insert_vertex(*self._tables(), self.origin, face, v, self.n_faces)
             self.along[v] = -1
         self.flat[v] = self.points[v] = point
         self.kind[v], self.place[v] = 2, place
 
     def flip(self, by_degree):
-        return _edges.flip_edges(
-            *self._tables(), self.points, self.n_faces, by_degree
-        )
+        return _edges.flip_edges(*self._tables(), self.points, self.n_faces, by_degree)
 
     def smooth(self, reach):
         """Move vertices within the surface; returns the face and weights of each on the input."""
         step = np.zeros((self.n_vertices, 3))
         _edges.relax(*self._tables(), self.kind, self.points, self.n_vertices, step)
         return self.settle(step, reach)
+
+    def stay(self):
+        """As `smooth`, but nothing moves."""
+        return self.settle(np.zeros((self.n_vertices, 3)), np.inf)
 
     def settle(self, step, reach):
         """Bring flat positions plus `step` back to the input and lift them onto the smooth surface.
@@ -195,6 +204,34 @@ class _Mesh:
         return self.corner[: 3 * self.n_faces].reshape(-1, 3)
 
 
+@dataclass
+class Resampling:
+    """A resampled surface, as places on its input.
+
+    Attributes
+    ----------
+    faces : (m, 3) int32
+    place_face : (n,) int32
+        Face of the input that holds each vertex.
+    place_weights : (n, 3) float64
+        Barycentric coordinates there. `SmoothInput.lift`, `flat` and `normals` give positions and normals.
+    spacing : float
+        Mean length of the edges on the flat faces of the input.
+    deviation : Deviation
+        Of the flat result from the input.
+    """
+
+    faces: np.ndarray
+    place_face: np.ndarray
+    place_weights: np.ndarray
+    spacing: float
+    deviation: Deviation
+
+    def __iter__(self):
+        """Faces, faces of the input and weights, to be unpacked."""
+        return iter((self.faces, self.place_face, self.place_weights))
+
+
 def resample(source, n_vertices, report=lambda done, total: None, polish=5, settle=6):
     """Resample a smooth input to about `n_vertices` evenly spaced vertices.
 
@@ -208,11 +245,7 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
 
     Returns
     -------
-    faces : (m, 3) int32
-    place_face : (n,) int64
-        Face of the input that holds each vertex.
-    place_weights : (n, 3) float64
-        Barycentric coordinates there. `source.lift` and `source.normals` give position and normal.
+    Resampling
 
     Raises
     ------
@@ -241,14 +274,45 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
         face, weights = mesh.smooth(0.5 * target)
         mesh.flip(i < settle // 2)
         report(polish + i, rounds)
-    for _ in range(_MORE_PINS):
-        if not held.pin(mesh, _LEFT * target, target):
+    for i in range(_MOST_MENDS + 1):
+        flat, faces = mesh.flat[: mesh.n_vertices], mesh.faces()
+        spacing = mean_edge(flat, faces)
+        deviation = measure(flat, faces, source.vertices, source.faces, spacing)
+        off = deviation.distances / spacing
+        lost = np.flatnonzero(off > _LEFT)
+        if i == _MOST_MENDS or not len(lost):
             break
+        lost = lost[np.argsort(-off[lost], kind="stable")]
+        _pin(mesh, deviation.points[lost], deviation.place[lost], deviation.face[lost], spacing)
         for _ in range(2):
-            face, weights = mesh.smooth(0.5 * target)
+            face, weights = mesh.smooth(0.5 * target) if i < _MOST_MENDS // 2 else mesh.stay()
             mesh.flip(False)
     points = mesh.points[: mesh.n_vertices]
-    return _in_order(mesh.faces(), points, face, weights)
+    faces, face, weights = _in_order(mesh.faces(), points, face, weights)
+    return Resampling(faces, face, weights, spacing, deviation)
+
+
+def _pin(mesh, points, place, face, spacing):
+    """Pin vertices to points of the input, of points closer to each other than 0.7 spacings to the first.
+
+    Parameters
+    ----------
+    mesh : _Mesh
+    points : (k, 3) float64
+    place : (k,) int
+        The face of the input that holds each.
+    face : (k,) int
+        The face of the mesh that is closest to each.
+    spacing : float
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    taken = np.zeros(len(points), bool)
+    for i in range(len(points)):
+        if not taken[i]:
+            taken[tree.query_ball_point(points[i], 0.7 * spacing)] = True
+            mesh.pin(face[i], points[i], place[i])
 
 
 class _Held:
@@ -274,31 +338,11 @@ class _Held:
         ] * source.vertices[end[half]]
 
     def pin(self, mesh, bound, spacing):
-        """Pin a vertex to each held point that lies farther from the mesh than `bound`.
-
-        Points closer to each other than 0.7 spacings share one. Returns how many were pinned.
-        """
-        import igl
-        from scipy.spatial import cKDTree
-
-        flat, faces = mesh.flat[: mesh.n_vertices], mesh.faces()
-        squared, nearest, _ = igl.point_mesh_squared_distance(
-            self.points, np.ascontiguousarray(flat), faces.astype(np.int64)
-        )
-        lost = np.flatnonzero(squared > bound**2)
-        if not len(lost):
-            return 0
-        lost = lost[np.argsort(-squared[lost], kind="stable")]
-        tree = cKDTree(self.points[lost])
-        taken = np.zeros(len(lost), bool)
-        done = 0
-        for i, p in enumerate(lost):
-            if taken[i]:
-                continue
-            taken[tree.query_ball_point(self.points[p], 0.7 * spacing)] = True
-            mesh.pin(nearest[p], self.points[p], self.face[p])
-            done += 1
-        return done
+        """Pin a vertex to each held point that lies farther from the mesh than `bound`."""
+        distance, face, _ = closest(self.points, mesh.flat[: mesh.n_vertices], mesh.faces())
+        lost = np.flatnonzero(distance > bound)
+        lost = lost[np.argsort(-distance[lost], kind="stable")]
+        _pin(mesh, self.points[lost], self.face[lost], face[lost], spacing)
 
 
 def _round(mesh, length):

@@ -7,6 +7,8 @@ import numpy as np
 from btfpipe.surface.topology import edge_normals_angle, half_edges, opposite_half_edges
 
 PHONG_ALPHA = 0.75
+# angles between faces up to which their vertices are rounded off in full, and from which on not at all
+_ROUND_DEG, _FLAT_DEG = 45, 75
 
 
 @dataclass
@@ -25,7 +27,8 @@ class SmoothInput:
     crease : (3 m,) bool
         Half-edges across which normals are not averaged.
     ease : (n,) float64
-        1 where the smooth surface may leave the faces, 0 at crease vertices.
+        1 where the smooth surface may leave the faces, 0 at vertices of creases and of sharp edges, which are
+        corners rather than coarse pieces of something round.
     alpha : float
         Strength of the Phong tessellation, 0 for the flat faces.
     """
@@ -118,14 +121,16 @@ def smooth_input(vertices, faces, crease_deg=None, alpha=PHONG_ALPHA):
         Strength of the Phong tessellation.
     """
     opposite = opposite_half_edges(faces)
+    angle = np.rad2deg(edge_normals_angle(vertices, faces, opposite))
     crease = np.zeros(len(opposite), bool)
     if crease_deg is not None:
-        angle = edge_normals_angle(vertices, faces, opposite)
-        crease = (opposite >= 0) & (angle > np.deg2rad(crease_deg))
+        crease = (opposite >= 0) & (angle > crease_deg)
     normals = _corner_normals(vertices, faces, opposite, crease)
-    ease = np.ones(len(vertices))
-    start, _ = half_edges(faces)
-    ease[start[crease]] = 0
+    sharpest = np.zeros(len(vertices))
+    start, end = half_edges(faces)
+    np.maximum.at(sharpest, np.r_[start, end], np.r_[angle, angle])
+    ease = np.clip((_FLAT_DEG - sharpest) / (_FLAT_DEG - _ROUND_DEG), 0, 1)
+    ease[start[crease]] = ease[end[crease]] = 0
     return SmoothInput(vertices, faces, normals, opposite, crease, ease, alpha)
 
 
