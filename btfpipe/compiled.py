@@ -1,6 +1,48 @@
-"""How inner kernels are compiled."""
+"""How kernels are compiled, and where their code is kept."""
 
-from numba import njit
+import contextlib
+import functools
+import threading
+
+import numba
+
+from btfpipe.code_cache import cache_folder
+
+_FOLDER = cache_folder()
+_CHANGING = threading.RLock()
+
+
+def njit(function=None, **options):
+    """Numba's ``njit``; with ``cache=True`` code is kept in the folder of the package's sources as they are (`code_cache`).
+
+    Parameters
+    ----------
+    function : callable
+    **options
+        As numba has them.
+    """
+    if function is None:
+        return functools.partial(njit, **options)
+    if options.get("cache"):
+        with _kept():
+            # numba refuses to cache where its folder has become unwritable
+            with contextlib.suppress(RuntimeError):
+                if _FOLDER is not None:
+                    return numba.njit(**options)(function)
+        options = options | {"cache": False}
+    return numba.njit(**options)(function)
+
+
+@contextlib.contextmanager
+def _kept():
+    """Make numba keep what is declared inside in our folder; other packages' functions stay where they are."""
+    with _CHANGING:
+        before = numba.config.CACHE_DIR
+        numba.config.CACHE_DIR = str(_FOLDER or before)
+        try:
+            yield
+        finally:
+            numba.config.CACHE_DIR = before
 
 
 def leaf(function=None, *, fastmath=False):

@@ -11,7 +11,9 @@ feature edges (1), or not at all (2). All three edits keep the mesh a manifold o
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from btfpipe.compiled import njit
 
 _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
 _RING = 96  # vertices of more neighbours than this are left alone
