@@ -30,14 +30,16 @@ def source_digest(*parts):
 
 
 def code_digest():
-    """Digest of all modules of the package, of 12 hex digits: what compiled code was made from.
+    """Digest of the package's modules, of 12 hex digits: what compiled code was made from.
 
-    Every process that compiles anything asks for it, so it has no more to do than to read the files.
+    Those of the command line are left out: no kernel is there, and nothing imports them. Every process that compiles anything
+    asks for it, so it has no more to do than to read the files.
     """
     root = os.path.dirname(os.path.abspath(__file__))
     paths = [
         os.path.join(folder, name)
         for folder, _, names in os.walk(root)
+        if folder != os.path.join(root, "cli")
         for name in names
         if name.endswith(".py")
     ]

@@ -11,6 +11,7 @@ from btfpipe.cli.options import (
     material_taken,
     progress,
     stage,
+    warn,
 )
 from btfpipe.errors import naming
 
@@ -122,6 +123,7 @@ def synthesize(
     from btfpipe import store
     from btfpipe.surface import Surface
     from btfpipe.synthesis.coherence import coherence_facts
+    from btfpipe.synthesis.field_fit import judge_field
     from btfpipe.synthesis.growth import grow_over_surface, scale_for
     from btfpipe.synthesis.plane import grow_over_plane
     from btfpipe.synthesis.sources import read_features
@@ -144,12 +146,15 @@ def synthesize(
         "full": full, "k": k, "levels": levels, "sweeps": sweeps, "coherence": coherence, "seed": seed,
         "distance": distance,
     }  # fmt: skip
+    fit, doubts = {}, []
     both = f"{features} on {surface or 'a plane'}"
     with naming(both), progress("synthesize", quiet) as report:
         if plane:
             grown = grow_over_plane(sample, plane, on_progress=report, **common)
         else:
             scale = scale_for(target, sample.levels[0].shape, texels_per_unit, repeats)
+            fit, doubts = judge_field(sample, target.levels[0], scale, math.radians(turn_deg))
+            warn(*doubts)
             grown = grow_over_surface(
                 sample, target, scale, turn=math.radians(turn_deg), threads=threads,
                 memory=memory, on_progress=report, **common,
@@ -171,6 +176,8 @@ def synthesize(
         "elements": grown.row.shape[1],
         "texels_per_unit": grown.texels_per_unit,
         **facts,
+        **fit,
+        "warnings": doubts,
         "candidates": steps[-1]["candidates"],
         "mean_distance": steps[-1]["mean_distance"],
         "fallbacks": sum(step["fallbacks"] for step in steps),

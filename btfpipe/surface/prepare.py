@@ -8,6 +8,7 @@ import numpy as np
 from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
+from btfpipe.surface.curl import curl_facts
 from btfpipe.surface.pyramid import parents
 from btfpipe.surface.remeshing import resample
 from btfpipe.surface.smooth_input import PHONG_ALPHA, smooth_input
@@ -126,6 +127,7 @@ def prepare(
         "boundaries": int(loops.sum()),
         "singularities": int((index != 0).sum()),
         "index_sum": int(index.sum()),
+        **curl_facts(finest),
         "euler_characteristic": int(euler.sum()),
         "repairs": sum(repairs.values()),
         "repaired": {key: count for key, count in repairs.items() if count},

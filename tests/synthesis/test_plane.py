@@ -93,10 +93,10 @@ def naive_growth(features, shape, k, sweeps, coherence, seed):
 
 
 @pytest.mark.parametrize(
-    ("shape", "levels", "coherence"), [((9, 11), 1, 0.0), ((9, 11), 1, 0.7), ((20, 24), 3, 0.7)]
+    ("shape", "levels", "coherence"), [((9, 11), 1, 0.0), ((9, 11), 1, 0.7), ((24, 20), 3, 0.7)]
 )
 def test_compiled_growth_equals_its_naive_twin(make_features, shape, levels, coherence):
-    size = {"rows": 20, "cols": 24} if levels > 1 else {}
+    size = {"rows": 20, "cols": 28} if levels > 1 else {}
     features = make_features(k=6, smooth=False, levels=levels, **size)
     options = {"k": 6, "sweeps": (2, 1), "coherence": coherence, "seed": 5}
     expected = naive_growth(features, shape, **options)
