@@ -28,7 +28,7 @@ except ImportError:  # where there are no such locks, old folders go by their ag
 
 _PACKAGE = Path(__file__).resolve().parent
 _LOCK = "held"  # a file in each folder; its time says when the folder was last used
-_KEPT = 3  # folders of other states of this copy, for going to and fro between two
+_KEPT = 3  # folders of other states of this copy, for going back and forth between two
 _MONTH = 30 * 24 * 3600
 _NAMES = re.compile(r"[0-9a-f]{8}-[0-9a-f]{12}(\.old-\d+)?")
 
@@ -53,7 +53,7 @@ def cache_folder():
         f"compiled code cannot be kept in {' or '.join(map(str, bases))}, so every run compiles anew for up to a minute;"
         " name a folder that can be written in BTFPIPE_CACHE.",
         RuntimeWarning,
-        stacklevel=3,
+        stacklevel=2,
     )
     return None
 
