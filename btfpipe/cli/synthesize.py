@@ -113,7 +113,9 @@ def synthesize(
     """Grow a Sample over a Surface, or over a plane (Tong et al. 2002).
 
     FEATURES is what `btfpipe textons` made; or a feature image (.npy or a picture), a Sample or a Model, whose texels are
-    then compared without textons. The result says which texel of the sample goes to each vertex.
+    then compared without textons. The result says which texel of the sample goes to each vertex. A
+    material that runs in one direction, such as cords, is warned of where the field would break its pattern and the field
+    turned by 90 degrees would not.
 
     \b
     Examples:

@@ -52,7 +52,7 @@ def test_what_lies_behind_a_point_light_throws_no_shadow(scene_file, render_file
 def test_what_lies_before_a_point_light_throws_a_widening_shadow(scene_file, render_file):
     lamp = {"type": "point", "position": [0.5, 1, 0.5], "intensity": [10, 20, 30]}
     card = {
-        "plane": {"center": [0.5, 0, 0.5], "s": [1, 0, 0], "t": [0, 0, -1], "size": [1, 0.6]},
+        "plane": {"center": [0.5, 0.5, 0.5], "s": [1, 0, 0], "t": [0, 0, -1], "size": [0.5, 0.3]},
         "albedo": [0, 0, 0],
     }
     below = ABOVE | {"position": [0, -0.5, 0]}
@@ -61,7 +61,7 @@ def test_what_lies_before_a_point_light_throws_a_widening_shadow(scene_file, ren
         for objects in ([GROUND], [GROUND, card])
     )
     x, z = np.meshgrid((np.arange(64) + 0.5) / 64 * 6 - 3, (np.arange(64) + 0.5) / 64 * 6 - 3)
-    # half-way between lamp and ground: twice as wide and deep
+    # a quarter of the way from the lamp to the ground: four times as wide and deep
     out = np.maximum(np.abs(x - 0.5) - 1.0, np.abs(z - 0.5) - 0.6)
     assert (covered[out < -0.02] == 0).all()
     np.testing.assert_array_equal(covered[out > 0.02], bare[out > 0.02])
