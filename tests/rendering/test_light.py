@@ -55,7 +55,7 @@ def test_what_lies_before_a_point_light_throws_a_widening_shadow(scene_file, ren
         "plane": {"center": [0.5, 0.5, 0.5], "s": [1, 0, 0], "t": [0, 0, -1], "size": [0.5, 0.3]},
         "albedo": [0, 0, 0],
     }
-    below = ABOVE | {"position": [0, -0.5, 0]}
+    below = ABOVE | {"position": [0, -0.5, 0], "target": [0, -1, 0]}
     bare, covered = (
         render_file(scene_file(objects, camera=below, lights=[lamp]))[..., :3]
         for objects in ([GROUND], [GROUND, card])
@@ -63,6 +63,8 @@ def test_what_lies_before_a_point_light_throws_a_widening_shadow(scene_file, ren
     x, z = np.meshgrid((np.arange(64) + 0.5) / 64 * 6 - 3, (np.arange(64) + 0.5) / 64 * 6 - 3)
     # a quarter of the way from the lamp to the ground: four times as wide and deep
     out = np.maximum(np.abs(x - 0.5) - 1.0, np.abs(z - 0.5) - 0.6)
+    assert bare.min() > 0
+    assert (out < -0.02).sum() > 200
     assert (covered[out < -0.02] == 0).all()
     np.testing.assert_array_equal(covered[out > 0.02], bare[out > 0.02])
 
