@@ -1,12 +1,14 @@
 """Where compiled code is kept: one folder for each state of the package's sources.
 
-Numba notices when the file of a kernel changes, and not when a helper in another file does that was compiled into it. So code
-compiled from other sources lies in another folder, named by a digest of all of them. The folder lies beside the package, in its
-``__pycache__``, so that it goes with the checkout and no other touches it; if that cannot be written, under the user's cache.
+Numba notices when the file of a kernel changes, and not when a helper in another file does that was
+compiled into it. So code compiled from other sources lies in another folder, named by a digest of
+all of them. The folder lies beside the package, in its ``__pycache__``, so that it goes with the
+checkout and no other touches it; if that cannot be written, under the user's cache.
 ``BTFPIPE_CACHE``, or else ``NUMBA_CACHE_DIR``, names a place instead.
 
-A process holds a shared lock on its folder until it ends. When a new folder is made, old ones that nobody holds go: all but the
-last few of this copy of the package, and those of other copies in the same place that were not used for a month.
+A process holds a shared lock on its folder until it ends. When a new folder is made, old ones that
+nobody holds go: all but the last few of this copy of the package, and those of other copies in the
+same place that were not used for a month.
 """
 
 import contextlib
@@ -50,7 +52,8 @@ def cache_folder():
                 _remove_old(folder)
             return folder
     warnings.warn(
-        f"compiled code cannot be kept in {' or '.join(map(str, bases))}, so every run compiles anew for up to a minute;"
+        f"compiled code cannot be kept in {' or '.join(map(str, bases))}, so every run compiles"
+        " anew for up to a minute;"
         " name a folder that can be written in BTFPIPE_CACHE.",
         RuntimeWarning,
         stacklevel=2,
@@ -76,7 +79,7 @@ def _bases():
 
 
 def _hold(folder):
-    """Make a folder unless it is there, and lock it for the life of this process; whether it is new.
+    """Make a folder if needed and lock it while this process lives; the folder, and whether it is new.
 
     Raises
     ------
@@ -128,7 +131,7 @@ def _last_use(folder):
 
 
 def _remove(folder, age):
-    """Remove a folder unless a process holds it; where locks do not say, unless it was used within a month."""
+    """Remove a folder unless it is held or, where locks do not say, was used within a month."""
     with contextlib.suppress(OSError):
         held = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         try:

@@ -13,7 +13,7 @@ _CHANGING = threading.RLock()
 
 
 def njit(function=None, **options):
-    """Numba's ``njit``; with ``cache=True`` code is kept in the folder of the package's sources as they are (`code_cache`).
+    """Numba's ``njit``; with ``cache=True`` code is kept by the state of the sources (`code_cache`).
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def njit(function=None, **options):
 
 @contextlib.contextmanager
 def _kept():
-    """Make numba keep what is declared inside in our folder; other packages' functions stay where they are."""
+    """Make numba keep what is declared inside in our folder, and nothing else."""
     with _CHANGING:
         before = numba.config.CACHE_DIR
         numba.config.CACHE_DIR = str(_FOLDER or before)
@@ -48,10 +48,11 @@ def _kept():
 def leaf(function=None, *, fastmath=False):
     """Compile a kernel that allocates nothing and returns no array.
 
-    Numba counts references to every array it takes out of a tuple, slices or hands on, each time with an atomic
-    instruction: in a search that compares a few dozen numbers between two such events this costs more than the work. A
-    kernel that only borrows arrays needs no counts, so they are switched off (``_nrt``, as in numba's own sources); one that
-    allocates all the same does not compile. Division by zero gives inf or nan instead of raising, as in numpy.
+    Numba counts references to every array it takes out of a tuple, slices or hands on, each time
+    with an atomic instruction: in a search that compares a few dozen numbers between two such
+    events this costs more than the work. A kernel that only borrows arrays needs no counts, so they
+    are switched off (``_nrt``, as in numba's own sources); one that allocates all the same does not
+    compile. Division by zero gives inf or nan instead of raising, as in numpy.
 
     Parameters
     ----------

@@ -6,8 +6,10 @@ import numpy as np
 
 _VECTORS = 16  # leading dimensions of a level's vectors, which fall in extent
 
-# angle: in which the material changes, from s towards t, radians in (-pi / 2, pi / 2]: cords along s change along t.
-# share: how much of the change is in one direction, 0 (in all alike, or in two at right angles) to 1.
+# angle: in which the material changes, from s towards t, radians in (-pi / 2, pi / 2]: cords along
+# s change along t.
+# share: how much of the change is in one direction, 0 (in all alike, or in two at right angles) to
+# 1.
 # period: of the strongest wave within a sixth of a turn of that direction, in texels.
 Direction = namedtuple("Direction", "angle share period")
 

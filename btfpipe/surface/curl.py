@@ -1,9 +1,10 @@
 """How far the directions of a field are from being the gradients of evenly spaced stripes.
 
-Stripes that cross a field s at a constant spacing have a phase whose gradient is s; where s has curl there is no such phase, and
-stripes have to begin or end. Around a closed path they are out of step by the path integral of s, which is that of its curl over
-the area inside. So the sum of the curl's magnitude over a surface, in spacings of the stripes, is about how many dislocations
-they have (Knöppel et al. 2015, Stripe patterns on surfaces, section 3).
+Stripes that cross a field s at a constant spacing have a phase whose gradient is s; where s has
+curl there is no such phase, and stripes have to begin or end. Around a closed path they are out of
+step by the path integral of s, which is that of its curl over the area inside. So the sum of the
+curl's magnitude over a surface, in spacings of the stripes, is about how many dislocations they
+have (Knöppel et al. 2015, Stripe patterns on surfaces).
 """
 
 import numpy as np
@@ -12,8 +13,9 @@ import numpy as np
 def face_curl(level, turn=0.0):
     """Integral of the curl of a unit direction over each face of a surface.
 
-    That is the circulation of ``<d, .>`` around the face. Along an edge `d` is the mean of its two ends; at either, the edge is
-    turned into the tangent plane at its full length, as transport along it does.
+    That is the circulation of ``<d, .>`` around the face. Along an edge `d` is the mean of its two
+    ends; at either, the edge is turned into the tangent plane at its full length, as transport
+    along it does.
 
     Parameters
     ----------
@@ -44,15 +46,17 @@ def face_curl(level, turn=0.0):
 def summed_curl(level, turn=0.0):
     """Sum of the magnitude of `face_curl` over all faces, in units of length.
 
-    Divided by the spacing of stripes that run at right angles to the direction, it is about the number of their dislocations.
+    Divided by the spacing of stripes that run at right angles to the direction, it is about the
+    number of their dislocations.
     """
     return float(np.abs(face_curl(level, turn)).sum())
 
 
 def curl_facts(level):
-    """``curl_s`` and ``curl_t``: the summed curl over 2 pi, which is that of stripes two pi units of length apart.
+    """``curl_s`` and ``curl_t``: the summed curl over 2 pi, for stripes 2 pi units of length apart.
 
-    Of `curl_s` the stripes run along t, of `curl_t` along s. Stripes d units apart have 2 pi / d times as many dislocations.
+    Of `curl_s` the stripes run along t, of `curl_t` along s. Stripes d units apart have 2 pi / d
+    times as many dislocations.
     """
     return {
         "curl_s": summed_curl(level) / (2 * np.pi),

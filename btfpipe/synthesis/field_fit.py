@@ -10,9 +10,10 @@ _FAR_BETTER, _WORTH_IT = 2.0, 5.0  # times fewer dislocations, and so many fewer
 
 
 def judge_field(features, level, texels_per_unit, turn=0.0):
-    """Say how many dislocations a material of one direction will have, and if a quarter turn would be far better.
+    """Say how many dislocations a material will have, and if a quarter turn would be far better.
 
-    The material is taken for evenly spaced stripes of its strongest wave; see `btfpipe.surface.curl`.
+    The material is taken for evenly spaced stripes of its strongest wave; see
+    `btfpipe.surface.curl`.
 
     Parameters
     ----------
@@ -26,8 +27,9 @@ def judge_field(features, level, texels_per_unit, turn=0.0):
     Returns
     -------
     facts : dict
-        ``one_directional``, from 0 to 1; of a material that is, ``period_texels`` of its stripes, about how many
-        ``dislocations`` they will have, and ``dislocations_turned_90`` with the field turned by a quarter.
+        ``one_directional``, from 0 to 1; of a material that is, ``period_texels`` of its stripes,
+        about how many ``dislocations`` they will have, and ``dislocations_turned_90`` with the
+        field turned by a quarter.
     warnings : list of str
     """
     material = dominant_direction(features.levels[0], features.toroidal)
@@ -46,9 +48,10 @@ def judge_field(features, level, texels_per_unit, turn=0.0):
     if here < _FAR_BETTER * turned or here - turned < _WORTH_IT:
         return facts, []
     return facts, [
-        f"the material runs in one direction, and along this field its pattern would break in about {here:.0f} places;"
-        f" turned by 90 degrees, in about {turned:.0f}. Pass --turn-deg {_quarter_more(turn)} here, give the surface another"
-        " field with `btfpipe surface --turn-deg`, or draw strokes for it (`btfpipe surface --field`)"
+        "the material runs in one direction, and along this field its pattern would break in about"
+        f" {here:.0f} places; turned by 90 degrees, in about {turned:.0f}. Pass --turn-deg"
+        f" {_quarter_more(turn)} here, give the surface another field with `btfpipe surface"
+        " --turn-deg`, or draw strokes for it (`btfpipe surface --field`)"
     ]
 
 
