@@ -105,7 +105,9 @@ def dislocations(level, turn, spacing):
     laplacian = coo_matrix(
         (np.r_[-wave, -wave.conj(), degree], (np.r_[j, i, own], np.r_[i, j, own])), (n, n)
     )
-    solve = splu((laplacian + 1e-6 * identity(n)).tocsc()).solve
+    matrix = (laplacian + 1e-6 * identity(n)).tocsc()
+    symmetric = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    solve = splu(matrix, permc_spec="MMD_AT_PLUS_A", **symmetric).solve
     psi = np.exp(2j * np.pi * np.random.default_rng(1).random(n))
     for _ in range(20):
         psi = solve(psi)
