@@ -1,9 +1,8 @@
 """Shading from a `HarmonicsModel`: the harmonics of a light and a view, contracted with a texel's codes."""
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.directions.pairs import lifted
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,

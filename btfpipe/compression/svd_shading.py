@@ -1,8 +1,8 @@
 """Shading from an SVD Model: blend the angular factors of the pairs around a light and view, then dot."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.sample.shading import PairShader, corners
 
 

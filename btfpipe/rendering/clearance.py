@@ -1,7 +1,8 @@
 """How far shadow rays must start from a surface whose shading normals are smoother than its facets."""
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 _ITERATIONS = (
     100  # reaches about ten edges far: the facets of an input mesh seen in a dense resampling of it

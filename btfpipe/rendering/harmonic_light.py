@@ -13,9 +13,8 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.compression.harmonics import HarmonicsModel
 from btfpipe.compression.harmonics_shading import (
     FAST,

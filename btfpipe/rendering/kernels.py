@@ -1,8 +1,8 @@
 """Compiled steps of the renderer, over the rays of one tile. Flat arrays in, given arrays filled."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.hashing import uniform
 
 

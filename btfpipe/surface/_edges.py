@@ -14,7 +14,9 @@ genus.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from btfpipe.compiled import njit
 
 _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
 _FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge

@@ -9,6 +9,7 @@ import numpy as np
 from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
+from btfpipe.surface.curl import curl_facts
 from btfpipe.surface.deviation import (
     MOST_SPACINGS,
     MOST_SPACINGS_AT_TIPS,
@@ -153,6 +154,7 @@ def prepare(
         "boundaries": int(loops.sum()),
         "singularities": int((index != 0).sum()),
         "index_sum": int(index.sum()),
+        **curl_facts(finest),
         "euler_characteristic": int(euler.sum()),
         "repairs": sum(repairs.values()),
         "repaired": {key: count for key, count in repairs.items() if count},

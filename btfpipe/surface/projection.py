@@ -4,7 +4,9 @@ A global search for the closest point may land on the other side of a thin wall.
 from a face to its neighbours for as long as that brings it nearer, and it does not cross feature lines.
 """
 
-from numba import njit, prange
+from numba import prange
+
+from btfpipe.compiled import njit
 
 _MOST_STEPS = 10_000  # faces that one walk may cross; distances fall, so it ends anyway
 _NEARER = 1 - 1e-9  # of the squared distance: less is rounding

@@ -32,6 +32,43 @@ def test_point_light_falls_off_with_the_square_of_the_distance(scene_file, rende
     np.testing.assert_allclose(picture[..., :3], expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("place", [[0, 1.2, 0], [0.9, 1.1, 0.9], [0.5, 4.0, 0.5]])
+def test_what_lies_behind_a_point_light_throws_no_shadow(scene_file, render_file, place):
+    """A card above the lamp is as if it were not there; one below it hides the lamp from its own shadow alone."""
+    lamp = {"type": "point", "position": [0.5, 1, 0.5], "intensity": [10, 20, 30]}
+    card = {
+        "plane": {"center": place, "s": [1, 0, 0], "t": [0, 0, -1], "size": [8, 8]},
+        "albedo": [0, 0, 0],
+    }
+    under = ABOVE | {"position": [0, 0.9, 0]}
+    bare, covered = (
+        render_file(scene_file(objects, camera=under, lights=[lamp]))
+        for objects in ([GROUND], [GROUND, card])
+    )
+    assert bare[..., :3].min() > 0
+    np.testing.assert_array_equal(covered[..., :3], bare[..., :3])
+
+
+def test_what_lies_before_a_point_light_throws_a_widening_shadow(scene_file, render_file):
+    lamp = {"type": "point", "position": [0.5, 1, 0.5], "intensity": [10, 20, 30]}
+    card = {
+        "plane": {"center": [0.5, 0.5, 0.5], "s": [1, 0, 0], "t": [0, 0, -1], "size": [0.5, 0.3]},
+        "albedo": [0, 0, 0],
+    }
+    below = ABOVE | {"position": [0, -0.5, 0], "target": [0, -1, 0]}
+    bare, covered = (
+        render_file(scene_file(objects, camera=below, lights=[lamp]))[..., :3]
+        for objects in ([GROUND], [GROUND, card])
+    )
+    x, z = np.meshgrid((np.arange(64) + 0.5) / 64 * 6 - 3, (np.arange(64) + 0.5) / 64 * 6 - 3)
+    # a quarter of the way from the lamp to the ground: four times as wide and deep
+    out = np.maximum(np.abs(x - 0.5) - 1.0, np.abs(z - 0.5) - 0.6)
+    assert bare.min() > 0
+    assert (out < -0.02).sum() > 200
+    assert (covered[out < -0.02] == 0).all()
+    np.testing.assert_array_equal(covered[out > 0.02], bare[out > 0.02])
+
+
 def test_two_lights_add_up(scene_file, render_file):
     lamps = [
         {"type": "directional", "direction": [1, 2, 0], "irradiance": [1, 2, 3]},
