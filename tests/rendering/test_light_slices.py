@@ -7,7 +7,7 @@ from btfpipe.compression.coded import compress_coded
 from btfpipe.compression.harmonics import compress_harmonics
 from btfpipe.parallel import single_threaded_blas
 from btfpipe.sample import Sample
-from btfpipe.sample.light_slices import LightSlices
+from btfpipe.compression.light_slices import LightSlices
 
 
 @pytest.fixture
