@@ -366,8 +366,8 @@ class _Packer:
         """Members and description for a step."""
         texture = _quantise(self.texture, step)
         angular = _quantise(self.angular, step)
-        least = max(1, angular[0, 0].size // _SPARSE)
-        live = [_live(texture, 0), *(_live(part, 0, least) for part in angular)]
+        least = angular[0, 0].size / _SPARSE
+        live = [_live(texture, 0), *(_worthwhile(part, least) for part in angular)]
         n = max(1, min(live[0], max(live[1:])))
         terms = [n, *(max(1, min(n, part)) for part in live[1:])]
         angular = [part[:k] for part, k in zip(angular, terms[1:], strict=True)]
@@ -443,6 +443,14 @@ def _live(planes, axis, least=1):
     others = tuple(a for a in range(planes.ndim) if a != axis)
     found = np.flatnonzero(np.count_nonzero(planes, axis=others) >= least)
     return int(found[-1]) + 1 if len(found) else 0
+
+
+def _worthwhile(planes, least):
+    """How many terms there are before those that have on average fewer numbers other than 0 than `least`."""
+    counts = np.count_nonzero(planes, axis=(1, 2))[::-1]
+    average = np.cumsum(counts) / np.arange(1, len(counts) + 1)
+    few = np.flatnonzero(average < least)
+    return len(counts) - (int(few[-1]) + 1 if len(few) else 0)
 
 
 def _file_bytes(members, source, about):

@@ -72,26 +72,53 @@ def _product(local, angular, pair, weight):
     """Product of a texel's factors with the blended ones of some pairs, over the terms of one colour."""
     total = np.float32(0)
     count = len(pair)
-    n = angular.shape[1]
-    # three pairs at a time, so that the texel's factors are loaded once for three
-    for p in range(0, count - 2, 3):
-        a = angular[pair[p]]
-        b = angular[pair[p + 1]]
-        c = angular[pair[p + 2]]
-        u = weight[p]
-        v = weight[p + 1]
-        w = weight[p + 2]
-        some = np.float32(0)
-        for k in range(n):
-            some += local[k] * (u * a[k] + v * b[k] + w * c[k])
-        total += some
-    for p in range(count - count % 3, count):
-        row = angular[pair[p]]
-        some = np.float32(0)
-        for k in range(n):
-            some += local[k] * row[k]
-        total += weight[p] * some
+    at = 0
+    while at < count:  # nine pairs, or three, or one: what the texel's factors are loaded for
+        if count - at >= 9:
+            total += _nine(local, angular, pair, weight, at)
+            at += 9
+        elif count - at >= 3:
+            total += _three(local, angular, pair, weight, at)
+            at += 3
+        else:
+            total += _one(local, angular[pair[at]], weight[at])
+            at += 1
     return total
+
+
+@leaf(fastmath=_FAST)
+def _nine(local, angular, pair, weight, at):
+    a, b, c = angular[pair[at]], angular[pair[at + 1]], angular[pair[at + 2]]
+    d, e, f = angular[pair[at + 3]], angular[pair[at + 4]], angular[pair[at + 5]]
+    g, h, i = angular[pair[at + 6]], angular[pair[at + 7]], angular[pair[at + 8]]
+    r, s, t = weight[at], weight[at + 1], weight[at + 2]
+    u, v, w = weight[at + 3], weight[at + 4], weight[at + 5]
+    x, y, z = weight[at + 6], weight[at + 7], weight[at + 8]
+    total = np.float32(0)
+    for k in range(len(a)):
+        first = r * a[k] + s * b[k] + t * c[k]
+        second = u * d[k] + v * e[k] + w * f[k]
+        third = x * g[k] + y * h[k] + z * i[k]
+        total += local[k] * ((first + second) + third)
+    return total
+
+
+@leaf(fastmath=_FAST)
+def _three(local, angular, pair, weight, at):
+    a, b, c = angular[pair[at]], angular[pair[at + 1]], angular[pair[at + 2]]
+    u, v, w = weight[at], weight[at + 1], weight[at + 2]
+    total = np.float32(0)
+    for k in range(len(a)):
+        total += local[k] * (u * a[k] + v * b[k] + w * c[k])
+    return total
+
+
+@leaf(fastmath=_FAST)
+def _one(local, row, weight):
+    total = np.float32(0)
+    for k in range(len(row)):
+        total += local[k] * row[k]
+    return weight * total
 
 
 @leaf(fastmath=_FAST)

@@ -188,7 +188,7 @@ class RootWeights(PairWeights):
             yield part, pair[:n], weight[:n]
 
     def _near_blocks(self, w_i, w_o):
-        blended = np.empty(self.angular[0].shape[1], np.float32)
+        blended = np.empty(len(self.tables.importance), np.float32)
         for part in blocks(len(w_i), _QUERIES):
             n = part.stop - part.start
             pair, weight = np.empty((n, self.most), np.int32), np.empty((n, self.most), np.float32)
