@@ -16,7 +16,7 @@ class NaiveRoots:
     """Evaluates a `CodedModel` query by query, whole vectors of roots in place of tables."""
 
     def __init__(self, model, interpolation="barycentric"):
-        self.model, self.interpolation = model, interpolation
+        self.model = model
         self.texture = np.asarray(model.texture_factors, float)
         n = self.texture.shape[2]
         self.angular = np.zeros((model.n_pairs, 3, n))
@@ -28,6 +28,16 @@ class NaiveRoots:
         )
         # a pair's roots over all texels, as the orthogonal texture factors let them be compared
         self.pair_vectors = self.angular_over_root * np.sqrt((self.texture**2).sum(axis=(0, 1)))
+        self.listed = not model.is_product or interpolation == "reciprocal"
+        if self.listed:
+            self.count = 4 if interpolation == "four" else 9
+            views = model.view_directions[model.view_index]
+            self.near = NearestPairs(lights, views, self.count, interpolation == "reciprocal")
+        else:
+            self.hemispheres = [
+                Hemisphere(d, interpolation)
+                for d in (model.light_directions, model.view_directions)
+            ]
         self.texel_scale = np.sqrt((self.angular**2).sum(axis=(0, 1)))
 
     def __call__(self, row, col, w_i, w_o):
@@ -53,20 +63,17 @@ class NaiveRoots:
     def _pairs(self, w_i, w_o):
         """Pairs, weights, and what the value is multiplied by for its brightness."""
         model = self.model
-        if not model.is_product or self.interpolation == "reciprocal":
-            lights, views = (
-                model.light_directions[model.light_index],
-                model.view_directions[model.view_index],
+        if self.listed:
+            pair, weight = (
+                np.zeros((1, self.count), np.int32),
+                np.zeros((1, self.count), np.float32),
             )
-            count = 4 if self.interpolation == "four" else 9
-            near = NearestPairs(lights, views, count, self.interpolation == "reciprocal")
-            pair, weight = np.zeros((1, count), np.int32), np.zeros((1, count), np.float32)
-            near.find(w_i[None], w_o[None], pair, weight)
-            vectors = self.pair_vectors[pair[0]].reshape(count, -1)
+            self.near.find(w_i[None], w_o[None], pair, weight)
+            vectors = self.pair_vectors[pair[0]].reshape(self.count, -1)
             return pair[0], weight[0], np.sqrt(gain(vectors, weight[0]))
         light, view = (
-            [a[0] for a in Hemisphere(d, self.interpolation).weights(w[None])]
-            for d, w in ((model.light_directions, w_i), (model.view_directions, w_o))
+            [a[0] for a in hemisphere.weights(w[None])]
+            for hemisphere, w in zip(self.hemispheres, (w_i, w_o), strict=True)
         )
         grid = self.pair_vectors.reshape(
             len(model.view_directions), len(model.light_directions), -1
