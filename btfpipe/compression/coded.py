@@ -134,7 +134,8 @@ class CodedModel(Model):
         if "view_basis" in reader:
             shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
         # each is unpacked into one array and laid out anew in another
-        return ShadingNeeds(texture + angular, max(texture, angular), *shared)
+        products = 20 * math.prod(shape)
+        return ShadingNeeds(texture + angular + products, max(texture, angular), *shared)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader

@@ -1,14 +1,16 @@
 """Blending square roots of values between texels, lights and views, without the loss of brightness.
 
-The square of a mean of roots is less than the mean of their squares by the variance of the roots: a picture blended so is too dark
-between the measured directions and texels. The roots are therefore blended with weights that are a little larger:
+The square of a mean of roots is less than the mean of their squares, by the variance of the roots:
+a picture blended so is too dark between the measured directions and texels. The roots are therefore
+blended with weights that are a little larger:
 
-- Between texels so much that the mean over all pairs is that of blended values, as an interpolated normal is given its length again.
-- Between lights, and between views, half of that (a square root of the factor): blended *values* are too bright there, as they
-  show a highlight or a lit yarn at two places instead of one between them.
+- Between texels so much that the mean over all pairs is that of blended values, as an interpolated
+  normal is given its length again.
+- Between lights, and between views, half of that (the square root of the factor): blended *values*
+  are too bright there, as they show a highlight or a lit yarn at two places instead of one between.
 
-The factors come from scalar products of the roots, summed over all pairs or texels. Those are tables of the sample's size and no more: the
-SVD's factors are orthogonal to each other, so that a sum over pairs or texels is one over the terms.
+The factors come from scalar products of the roots, summed over all pairs or all texels. The SVD's
+factors are orthogonal to each other, so that such a sum is one over the terms.
 """
 
 import numpy as np
@@ -36,10 +38,12 @@ class RootTables:
     Attributes
     ----------
     texels : (rows * cols, 5) float32
-        Scalar product of each texel's roots with its own, and with those of the texels to the right, below, below to the right;
-        that of the texels to the right and below with each other. Over the borders of the sample it goes on at the other side.
+        Scalar products of each texel's roots with its own, and with those of the texels to the
+        right, below, and below to the right; and of the texels to the right and below with each
+        other. Beyond its borders the sample goes on at the other side.
     lights, views : (n, n) float64
-        Scalar products of the roots of value / cos(theta_i) under each light and from each view; only of a full grid.
+        Scalar products of the roots of value / cos(theta_i) under each light and from each view;
+        only of a full grid.
     importance : (n,) float32
         Sum of the squares of each term over the texels.
     """
@@ -105,7 +109,7 @@ def _multiply_neighbours(texture, power, out):
 
 @leaf
 def texel_gain(products, texel, weight):
-    """What the blended roots of four texels, as `corners` gives them, are multiplied by to keep their mean square."""
+    """What four texels' blended roots are multiplied by to keep their mean square."""
     a = products[texel[0]]
     b = products[texel[1]]
     c = products[texel[2]]
@@ -121,7 +125,7 @@ def texel_gain(products, texel, weight):
 
 @leaf
 def _factor(kept, blended):
-    """What a blended mean square is multiplied by to become the mean of the squares; 1 where all is black."""
+    """A mean of squares over the square of a mean; 1 where all is black."""
     return kept / max(blended, kept / _MOST) if kept > 0 else 1.0
 
 
@@ -147,7 +151,8 @@ class RootWeights(PairWeights):
         See `PairWeights`.
     tables : RootTables
     angular : list of (pairs, n_k) float32
-        As for `RootTables`; a list of pairs has no tables of directions, so that its factors are found query by query.
+        As for `RootTables`. A list of pairs has no tables of directions: its factors are found
+        query by query.
     """
 
     def __init__(self, appearance, interpolation, tables, angular):
@@ -162,17 +167,17 @@ class RootWeights(PairWeights):
                     self.power[some] += np.square(part[some]) @ tables.importance[: part.shape[1]]
 
     def find_lights(self, w_i, light, weight):
-        """Fill `light`, `weight` (n, 4) for lights (n, 3): weights of roots as measured, cosines and brightness inside."""
+        """Fill `light`, `weight` (n, 4) for lights (n, 3): of roots, cosine and gain inside."""
         find(self.lights, w_i, light, weight)
         _weigh_lights(self.tables.lights, self.roots, w_i, light, weight)
 
     def find_views(self, w_o, view, weight):
-        """Fill `view`, `weight` (n, 4) for views (n, 3): weights of roots, brightness inside."""
+        """Fill `view`, `weight` (n, 4) for views (n, 3): weights of roots, gain inside."""
         find(self.views, w_o, view, weight)
         _weigh_views(self.tables.views, view, weight)
 
     def blocks(self, w_i, w_o):
-        """As `PairWeights.blocks`; the weights are those of roots, whose square is the value."""
+        """As `PairWeights.blocks`, but with weights of roots: the blend squared is the value."""
         if self.near is not None:
             yield from self._near_blocks(w_i, w_o)
             return
@@ -194,7 +199,8 @@ class RootWeights(PairWeights):
             pair, weight = np.empty((n, self.most), np.int32), np.empty((n, self.most), np.float32)
             self.near.find(w_i[part], w_o[part], pair, weight)
             _weigh_pairs(
-                *self.angular, self.tables.importance, self.power, self.roots, w_i[part], pair, blended, weight
+                *self.angular, self.tables.importance, self.power, self.roots, w_i[part],
+                pair, blended, weight,
             )  # fmt: skip
             yield part, pair, weight
 

@@ -7,6 +7,7 @@ from btfpipe.metrics.comparison import compare, model_pictures
 from btfpipe.sample import Sample
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["weave", "cords"])
 def test_blended_roots_are_nearer_the_truth_than_blended_values(
     data, command, ingested, tmp_path, name
