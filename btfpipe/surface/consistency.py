@@ -12,35 +12,46 @@ _MOST_ITERATIONS = 100
 _TOLERANCE = 1e-3
 
 
-def consistent_heights(vertices, faces, normals):
-    """How far to move vertices along their shading normals so that the triangles agree with these.
+def consistent_positions(vertices, faces, normals, ease=1.0):
+    """Move vertices along their shading normals so that the triangles agree with these.
 
     A coarse mesh that is resampled densely keeps its facets, while shading normals turn smoothly across them.
     Where light grazes, such facets lie in their own or each other's shadow, though the surface that the normals
-    describe does not. Positions and normals are brought together as in Nehab, Rusinkiewicz, Davis and
-    Ramamoorthi 2005 (Efficiently combining positions and normals for precise 3D geometry, section 4): the
-    heights h make edges orthogonal to the mean normal of their ends in the least squares sense,
+    describe does not; Phong tessellation makes them flatter, not smooth. No offset of single points mends that,
+    as the facets are wider than a face. Positions and normals are brought together as in Nehab, Rusinkiewicz,
+    Davis and Ramamoorthi 2005 (Efficiently combining positions and normals for precise 3D geometry): the heights
+    h make edges orthogonal to the mean normal of their ends in the least squares sense,
 
         sum over edges ((x_j - x_i) . (n_i + n_j) / 2 + h_j - h_i)^2 + e sum over vertices h_i^2 -> min.
 
-    Triangles whose normals agree with them to second order, on whatever coarse mesh, stay where they are.
+    Edges that cross creases are left out. Triangles that agree with their normals to second order, on whatever
+    coarse mesh, stay where they are.
 
     Parameters
     ----------
     vertices : (n, 3) float64
     faces : (m, 3) int32
-    normals : (n, 3) float32
+    normals : (n, 3) float64 or float32
         Unit shading normals.
+    ease : float or (n,) float64
+        Fraction of its height that a vertex moves: 0 for those that must stay.
 
     Returns
     -------
-    (n,) float64
-        In units of the scene.
+    (n, 3) float64
+        No vertex moves farther than its edges are long on average.
     """
+    heights = np.asarray(ease * _heights(vertices, faces, np.asarray(normals, np.float64)))
+    return vertices + heights[:, None] * normals
+
+
+def _heights(vertices, faces, normals):
+    """Heights (n,) float64 of the vertices over themselves, in units of the scene."""
     first, after = _neighbours(faces, len(vertices))
-    weight, degree, wanted = np.empty(len(after)), np.empty(len(vertices)), np.empty(len(vertices))
-    _equations(vertices, normals, first, after, weight, degree, wanted)
-    return _solve(first, after, weight, degree, wanted)
+    weight = np.empty(len(after))
+    degree, wanted, edge = (np.empty(len(vertices)) for _ in range(3))
+    _equations(vertices, normals, first, after, weight, degree, wanted, edge)
+    return np.clip(_solve(first, after, weight, degree, wanted), -edge, edge)
 
 
 def _neighbours(faces, count):
@@ -54,11 +65,12 @@ def _neighbours(faces, count):
 
 
 @njit(cache=True, nogil=True)
-def _equations(vertices, normals, first, after, weight, degree, wanted):
-    """Weights of all edges, 0 across creases, their sums, and the right-hand side."""
+def _equations(vertices, normals, first, after, weight, degree, wanted, length):
+    """Weights of all edges, 0 across creases, their sums, the right-hand side, and mean lengths of edges."""
     for i in range(len(vertices)):
         degree[i] = 0.0
         wanted[i] = 0.0
+        length[i] = 0.0
         for e in range(first[i], first[i + 1]):
             j = after[e]
             rise = 0.0
@@ -74,6 +86,7 @@ def _equations(vertices, normals, first, after, weight, degree, wanted):
             weight[e] = 1.0 if smooth else 0.0
             degree[i] += weight[e]
             wanted[i] += weight[e] * rise
+            length[i] += np.sqrt(edge) / (first[i + 1] - first[i])
 
 
 @njit(cache=True, nogil=True)

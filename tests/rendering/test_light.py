@@ -6,7 +6,7 @@ import pytest
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.surface import Surface
-from btfpipe.surface.consistency import consistent_heights
+from btfpipe.surface.consistency import consistent_positions
 from btfpipe.surface.surface import Level
 
 GROUND = {
@@ -122,8 +122,7 @@ def test_facets_of_a_densely_resampled_coarse_mesh_do_not_shade_it(
         return (lit & (picture[..., 0] == 0)).sum() / lit.sum()
 
     assert dark_share() > 0.01
-    heights = consistent_heights(level.vertices, level.faces, level.normals)
-    level.vertices = level.vertices + heights[:, None] * level.normals
+    level.vertices = consistent_positions(level.vertices, level.faces, level.normals)
     assert dark_share() <= 0.002
 
 
