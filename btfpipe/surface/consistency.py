@@ -8,6 +8,7 @@ _STEEPEST = 0.35
 # Pull towards the given surface, in the equation of one vertex. Heights follow normals up to some seven edges
 # far, the facets of an input mesh seen in a dense resampling of it, and not farther.
 _SCREENING = 0.03
+_MOST_EDGES = 2.0
 _MOST_ITERATIONS = 100
 _TOLERANCE = 1e-3
 
@@ -39,7 +40,7 @@ def consistent_positions(vertices, faces, normals, ease=1.0):
     Returns
     -------
     (n, 3) float64
-        No vertex moves farther than its edges are long on average.
+        No vertex moves farther than two edges of mean length.
     """
     heights = np.asarray(ease * _heights(vertices, faces, np.asarray(normals, np.float64)))
     return vertices + heights[:, None] * normals
@@ -51,7 +52,8 @@ def _heights(vertices, faces, normals):
     weight = np.empty(len(after))
     degree, wanted, edge = (np.empty(len(vertices)) for _ in range(3))
     _equations(vertices, normals, first, after, weight, degree, wanted, edge)
-    return np.clip(_solve(first, after, weight, degree, wanted), -edge, edge)
+    limit = _MOST_EDGES * edge.mean()
+    return np.clip(_solve(first, after, weight, degree, wanted), -limit, limit)
 
 
 def _neighbours(faces, count):

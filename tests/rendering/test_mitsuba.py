@@ -127,11 +127,16 @@ def _dark_in_one(ours, theirs, inside):
     return inside & ((ours < dark) != (theirs < dark))
 
 
-def _write_beside(ours, theirs):
+def _write_beside(ours, theirs, covered):
+    """Ours, theirs and ten times the difference, cut to what is covered."""
     from btfpipe.formats.images import encode_picture
 
-    difference = np.abs(ours - theirs)
-    shown = np.concatenate([ours, theirs, difference], axis=1).clip(0, 1) ** (1 / 2.2)
+    rows, cols = (np.flatnonzero(covered.any(axis=k)) for k in (1, 0))
+    ours, theirs = (a[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] for a in (ours, theirs))
+    gap = np.ones((len(ours), 4))
+    parts = [ours, gap, theirs, gap, 10 * np.abs(ours - theirs)]
+    shown = np.concatenate(parts, axis=1).clip(0, 1) ** (1 / 2.2)
+    shown = shown.repeat(2, axis=0).repeat(2, axis=1)
     codes = np.repeat(np.round(255 * shown).astype(np.uint8)[..., None], 3, axis=2)
     target = HERE / ".benchmarks" / "shadows.png"
     target.parent.mkdir(exist_ok=True)
@@ -158,7 +163,7 @@ def test_few_pixels_are_dark_in_one_program_only(count, peer, surfaces):
         f" density); mean difference {100 * mean:.2f} %\n"
     )
     if count == 250_000:
-        _write_beside(ours, same)
+        _write_beside(ours, same, picture[..., 3] > 0)
     assert inside.sum() > 10_000
     assert far <= 0.005
     assert near <= 0.01

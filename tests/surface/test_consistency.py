@@ -73,13 +73,13 @@ def test_corners_of_a_cube_with_normals_of_one_side_stay():
 
 
 def test_far_disagreement_does_not_blow_a_mesh_up():
-    """A large flat square with the normals of a ball moves by an edge, not the ten into the ball."""
+    """A large flat square with the normals of a ball moves by two edges, not the ten into the ball."""
     vertices, faces, normals, _ = _bumpy_plane(side=60)
     middle = vertices - [29.5, 29.5, -40]
     normals = (middle / np.linalg.norm(middle, axis=1, keepdims=True)).astype(np.float32)
     heights = consistent_heights(vertices, faces, normals)
     assert np.isfinite(heights).all()
-    assert 0.5 < np.abs(heights).max() < 1.2
+    assert 1 < np.abs(heights).max() <= 2.4
 
 
 def test_eased_vertices_move_less():
