@@ -36,6 +36,24 @@ def peer_pictures(scene, samples=64):
     return np.stack(pictures)
 
 
+def peer_picture_under_map(scene, values, rotate_deg=0.0, samples=64):
+    """Render a Scene's objects under a latitude-longitude map alone: linear colour (height, width, 3) float32.
+
+    The map is sampled at random there, and its first row lies on the pole instead of half a pixel from it.
+    """
+    mi = mitsuba()
+    parts = {"type": "scene", "sensor": _sensor(mi, scene, samples)}
+    parts["integrator"] = {"type": "path", "max_depth": 2, "hide_emitters": True}
+    for number, thing in enumerate(scene.objects):
+        parts[f"object{number}"] = peer_mesh(mi, thing, f"object{number}")
+    parts["light"] = {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.asarray(values, np.float32)),
+        "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180 + rotate_deg),
+    }
+    return np.array(mi.render(mi.load_dict(parts)))[..., :3]
+
+
 def peer_mesh(mi, thing, name):
     """A mesh of the same vertices, faces and shading normals, lit on both sides."""
     reflectance = {"type": "rgb", "value": [float(a) for a in thing.albedo]}
