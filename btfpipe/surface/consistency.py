@@ -5,9 +5,9 @@ from numba import njit
 
 # Edges that leave the normals' tangent plane by more (a sine, 20 degrees) cross creases and corners.
 _STEEPEST = 0.35
-# Pull towards the given surface, in the equation of one vertex. Heights follow normals up to some four edges
+# Pull towards the given surface, in the equation of one vertex. Heights follow normals up to some seven edges
 # far, the facets of an input mesh seen in a dense resampling of it, and not farther.
-_SCREENING = 0.1
+_SCREENING = 0.03
 _MOST_EDGES = 2.0
 _MOST_ITERATIONS = 100
 _TOLERANCE = 1e-3
