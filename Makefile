@@ -9,7 +9,7 @@ SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: all setup sample gallery formats data-sample test test-slow fuzz mutants bench lint fix clean
+.PHONY: all setup sample gallery formats data-sample test test-slow fuzz mutants bench peers lint fix clean
 
 all: lint test
 
@@ -62,6 +62,11 @@ mutants: $(READY)
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench,test,lint]"
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -s -q
+
+# Pictures and meshes beside those of other programs, which are installed here only.
+peers: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[peers,test,lint]"
+	$(BIN)/python -m pytest -m peer -s -q
 
 lint: $(READY)
 	$(BIN)/ruff check .

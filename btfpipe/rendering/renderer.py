@@ -5,7 +5,6 @@ import numpy as np
 from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
-from btfpipe.rendering.clearance import clearance
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
@@ -46,9 +45,6 @@ class Renderer:
         self.seed = seed
         self.vertices = np.concatenate([t.vertices for t in scene.objects])
         self.normals = np.concatenate([t.normals for t in scene.objects])
-        self.clearance = np.concatenate(
-            [clearance(t.vertices, t.faces, t.normals) for t in scene.objects]
-        )
         first_vertex = np.cumsum([0] + [len(t.vertices) for t in scene.objects])
         self.first_face = np.cumsum([0] + [len(t.faces) for t in scene.objects])
         self.faces = np.concatenate(
@@ -60,8 +56,6 @@ class Renderer:
             if _is_sliced(thing, scene.lights)
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
-        # single precision positions are this far off at the scene's size
-        self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
         self.tree = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self.tree, self.vertices.astype(np.float32), self.faces)
         ray = np.zeros((1, 3), np.float32)
@@ -224,9 +218,9 @@ class Points:
         self.share, self.point, self.start, self.normal = (np.empty((n, 3)) for _ in range(4))
         self.facing, self.depth = np.empty(n), np.empty(n)
         kernels.surface_points(
-            hits, prim, origins, directions, renderer.vertices, renderer.faces, renderer.normals,
-            renderer.clearance, renderer.smallest, self.share, self.point, self.start, self.normal, self.facing,
-            self.depth,
+            hits, prim, origins, directions,
+            renderer.vertices, renderer.faces, renderer.normals,
+            self.share, self.point, self.start, self.normal, self.facing, self.depth,
         )  # fmt: skip
         self.toward_eye = -directions[hits]
         self.thing = np.searchsorted(renderer.first_face, prim[hits], side="right") - 1
