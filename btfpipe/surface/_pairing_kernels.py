@@ -1,6 +1,7 @@
 """Compiled traversal and matching of half-edges, for `_pairing`; loaded when a mesh needs them."""
 
 import numpy as np
+
 from btfpipe.compiled import njit
 
 _MOST_COMPARED = 64  # half-edges of an edge of which every two are compared

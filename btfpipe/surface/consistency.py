@@ -1,7 +1,8 @@
 """Geometry that agrees with shading normals: what shadows are cast by and received on."""
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 # Edges that leave the normals' tangent plane by more (a sine, 20 degrees) cross creases and corners.
 _STEEPEST = 0.35
