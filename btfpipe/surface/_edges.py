@@ -125,6 +125,63 @@ def _area2(points, corner, h):
 
 
 @njit(cache=True, nogil=True)
+def _split(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces, h, near,
+):  # fmt: skip
+    """Halve the edge at h; `near` says that feature lines are followed from its ends. Returns the new numbers."""
+    a, b = corner[h], corner[_next(h)]
+    g = opposite[h]
+    mark = feature[h]
+    m = n_vertices
+    n_vertices += 1
+    for axis in range(3):
+        points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
+        flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
+    kind[m] = 1 if mark else 0
+    along[m] = mark - 1
+    if mark and near:
+        # nearer than where the whole edge once was
+        along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
+    place[m] = origin[h // 3]
+    # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
+    f = 3 * n_faces
+    origin[n_faces] = origin[h // 3]
+    n_faces += 1
+    h1 = _next(h)
+    c = corner[_previous(h)]
+    outer, outer_mark = opposite[h1], feature[h1]
+    corner[h1] = m
+    corner[f], corner[f + 1], corner[f + 2] = m, b, c
+    _join(opposite, feature, f + 1, outer, outer_mark)
+    _join(opposite, feature, f + 2, h1, 0)
+    if g < 0:
+        _join(opposite, feature, f, -1, mark)
+        _join(opposite, feature, h, -1, mark)
+        leave[m] = f
+    else:
+        # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
+        e = 3 * n_faces
+        origin[n_faces] = origin[g // 3]
+        n_faces += 1
+        g1 = _next(g)
+        d = corner[_previous(g)]
+        outer, outer_mark = opposite[g1], feature[g1]
+        corner[g1] = m
+        corner[e], corner[e + 1], corner[e + 2] = m, a, d
+        _join(opposite, feature, e + 1, outer, outer_mark)
+        _join(opposite, feature, e + 2, g1, 0)
+        _join(opposite, feature, e, h, mark)
+        _join(opposite, feature, f, g, mark)
+        leave[m] = f
+        if g >= 0 and leave[a] == g1:
+            leave[a] = e + 1
+    if leave[b] == h1:
+        leave[b] = f + 1
+    return n_vertices, n_faces
+
+
+@njit(cache=True, nogil=True)
 def split_long(
     corner, opposite, feature, leave, kind, place, along, origin, points, flat,
     n_vertices, n_faces, longest, thin,
@@ -155,58 +212,15 @@ def split_long(
                 continue
             if n_vertices + 1 > len(points) or 3 * (n_faces + 2) > len(corner):
                 return n_vertices, n_faces, False
-            g = opposite[h]
-            mark = feature[h]
-            if mark == 0 and thin > 0.0:
-                low = min(_area2(points, corner, h), _area2(points, corner, g))
+            if feature[h] == 0 and thin > 0.0:
+                low = min(_area2(points, corner, h), _area2(points, corner, opposite[h]))
                 if low < thin * thin * length:
                     continue
             changed = True
-            m = n_vertices
-            n_vertices += 1
-            for axis in range(3):
-                points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
-                flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
-            kind[m] = 1 if mark else 0
-            along[m] = mark - 1
-            if mark and thin == 0.0:
-                # nearer than where the whole edge once was
-                along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
-            place[m] = origin[h // 3]
-            # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
-            f = 3 * n_faces
-            origin[n_faces] = origin[h // 3]
-            n_faces += 1
-            h1 = _next(h)
-            c = corner[_previous(h)]
-            outer, outer_mark = opposite[h1], feature[h1]
-            corner[h1] = m
-            corner[f], corner[f + 1], corner[f + 2] = m, b, c
-            _join(opposite, feature, f + 1, outer, outer_mark)
-            _join(opposite, feature, f + 2, h1, 0)
-            if g < 0:
-                _join(opposite, feature, f, -1, mark)
-                _join(opposite, feature, h, -1, mark)
-                leave[m] = f
-            else:
-                # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
-                e = 3 * n_faces
-                origin[n_faces] = origin[g // 3]
-                n_faces += 1
-                g1 = _next(g)
-                d = corner[_previous(g)]
-                outer, outer_mark = opposite[g1], feature[g1]
-                corner[g1] = m
-                corner[e], corner[e + 1], corner[e + 2] = m, a, d
-                _join(opposite, feature, e + 1, outer, outer_mark)
-                _join(opposite, feature, e + 2, g1, 0)
-                _join(opposite, feature, e, h, mark)
-                _join(opposite, feature, f, g, mark)
-                leave[m] = f
-                if g >= 0 and leave[a] == g1:
-                    leave[a] = e + 1
-            if leave[b] == h1:
-                leave[b] = f + 1
+            n_vertices, n_faces = _split(
+                corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+                n_vertices, n_faces, h, thin == 0.0,
+            )  # fmt: skip
     return n_vertices, n_faces, True
 
 
@@ -260,6 +274,87 @@ def _folds(corner, points, out, n, skip1, skip2, x, y, z, least):
 
 
 @njit(cache=True, nogil=True)
+def _collapse(
+    corner, opposite, feature, leave, kind, points, flat, h, bound, least,
+    out_a, out_b, near_a, near_b,
+):  # fmt: skip
+    """Collapse the edge at h, from its start to its end, if nothing folds, tears or gets too long; returns whether."""
+    g = opposite[h]
+    a, b = corner[h], corner[_next(h)]
+    if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
+        return False
+    h1, h2 = _next(h), _previous(h)
+    if kind[a] == 1 and feature[h2]:
+        return False
+    boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
+    if boundary_a and boundary_b and g >= 0:
+        return False
+    faces_a, n_a = _ring(corner, opposite, leave, a, out_a, near_a)
+    faces_b, n_b = _ring(corner, opposite, leave, b, out_b, near_b)
+    if n_a < 0 or n_b < 0:
+        return False
+    common = 0
+    for i in range(n_a):
+        for j in range(n_b):
+            common += near_a[i] == near_b[j]
+    if common != (1 if g < 0 else 2):
+        return False
+    outer1, outer2 = opposite[h1], opposite[h2]
+    if outer1 < 0 and outer2 < 0:
+        return False
+    if not _may_lose(corner, opposite, leave, corner[h2]):
+        return False
+    inner1, inner2 = -1, -1
+    if g >= 0:
+        g1, g2 = _next(g), _previous(g)
+        inner1, inner2 = opposite[g1], opposite[g2]
+        if inner1 < 0 and inner2 < 0:
+            return False
+        if kind[a] == 1 and feature[g1]:
+            return False
+        if not _may_lose(corner, opposite, leave, corner[g2]):
+            return False
+    both = kind[a] == 0 and kind[b] == 0
+    share = 0.5 if both else 0.0
+    x = points[b, 0] + share * (points[a, 0] - points[b, 0])
+    y = points[b, 1] + share * (points[a, 1] - points[b, 1])
+    z = points[b, 2] + share * (points[a, 2] - points[b, 2])
+    stretched = False
+    for i in range(n_a + n_b if both else n_a):
+        v = near_a[i] if i < n_a else near_b[i - n_a]
+        now = (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2
+        if now > bound and now > _STRETCH * _length2(points, v, a if i < n_a else b):
+            stretched = True
+            break
+    f0 = h // 3
+    f1 = g // 3 if g >= 0 else -1
+    if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z, least):
+        return False
+    if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z, least):
+        return False
+    points[b, 0], points[b, 1], points[b, 2] = x, y, z
+    for axis in range(3):
+        flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
+    c = corner[h2]
+    d = corner[_previous(g)] if g >= 0 else -1
+    mark = max(feature[h1], feature[h2])
+    inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
+    for i in range(faces_a):
+        corner[out_a[i]] = b
+    corner[3 * f0] = -1
+    _join(opposite, feature, outer1, outer2, mark)
+    if g >= 0:
+        corner[3 * f1] = -1
+        _join(opposite, feature, inner1, inner2, inner_mark)
+    leave[a] = -1
+    _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
+    _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
+    if g >= 0:
+        _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
+    return True
+
+
+@njit(cache=True, nogil=True)
 def collapse_short(
     corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest, least
 ):
@@ -276,87 +371,46 @@ def collapse_short(
     for start in range(3 * n_faces):
         if corner[start - start % 3] < 0 or opposite[start] > start:
             continue
+        if _length2(points, corner[start], corner[_next(start)]) >= limit:
+            continue
         for side in range(2):
-            h, g = start, opposite[start]
-            if side == 1:
-                if g < 0:
-                    break
-                h, g = g, h
-            a, b = corner[h], corner[_next(h)]
-            if _length2(points, a, b) >= limit:
+            h = start if side == 0 else opposite[start]
+            if h >= 0 and _collapse(
+                corner, opposite, feature, leave, kind, points, flat, h, bound, least,
+                out_a, out_b, near_a, near_b,
+            ):  # fmt: skip
+                done += 1
                 break
-            if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
-                continue
-            h1, h2 = _next(h), _previous(h)
-            if kind[a] == 1 and feature[h2]:
-                continue
-            boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
-            if boundary_a and boundary_b and g >= 0:
-                continue
-            faces_a, n_a = _ring(corner, opposite, leave, a, out_a, near_a)
-            faces_b, n_b = _ring(corner, opposite, leave, b, out_b, near_b)
-            if n_a < 0 or n_b < 0:
-                continue
-            common = 0
-            for i in range(n_a):
-                for j in range(n_b):
-                    common += near_a[i] == near_b[j]
-            if common != (1 if g < 0 else 2):
-                continue
-            outer1, outer2 = opposite[h1], opposite[h2]
-            if outer1 < 0 and outer2 < 0:
-                continue
-            if not _may_lose(corner, opposite, leave, corner[h2]):
-                continue
-            inner1, inner2 = -1, -1
-            if g >= 0:
-                g1, g2 = _next(g), _previous(g)
-                inner1, inner2 = opposite[g1], opposite[g2]
-                if inner1 < 0 and inner2 < 0:
-                    continue
-                if kind[a] == 1 and feature[g1]:
-                    continue
-                if not _may_lose(corner, opposite, leave, corner[g2]):
-                    continue
-            both = kind[a] == 0 and kind[b] == 0
-            share = 0.5 if both else 0.0
-            x = points[b, 0] + share * (points[a, 0] - points[b, 0])
-            y = points[b, 1] + share * (points[a, 1] - points[b, 1])
-            z = points[b, 2] + share * (points[a, 2] - points[b, 2])
-            stretched = False
-            for i in range(n_a + n_b if both else n_a):
-                v = near_a[i] if i < n_a else near_b[i - n_a]
-                now = (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2
-                if now > bound and now > _STRETCH * _length2(points, v, a if i < n_a else b):
-                    stretched = True
+    return done
+
+
+@njit(cache=True, nogil=True)
+def collapse_of(corner, opposite, feature, leave, kind, points, flat, chosen):
+    """Collapse the shortest edge that may go of each face of `chosen`, whatever folds; returns how many did."""
+    out_a, out_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    near_a, near_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    done = 0
+    for f in chosen:
+        tried = np.zeros(3, np.uint8)
+        for _ in range(3):
+            k, least = -1, np.inf
+            for i in range(3):
+                if corner[3 * f] >= 0 and tried[i] == 0:
+                    length = _length2(points, corner[3 * f + i], corner[_next(3 * f + i)])
+                    if length < least:
+                        k, least = i, length
+            if k < 0:
+                break
+            tried[k] = 1
+            for side in range(2):
+                h = 3 * f + k if side == 0 else opposite[3 * f + k]
+                if h >= 0 and _collapse(
+                    corner, opposite, feature, leave, kind, points, flat, h, np.inf, -2.0,
+                    out_a, out_b, near_a, near_b,
+                ):  # fmt: skip
+                    done += 1
+                    tried[:] = 1
                     break
-            f0 = h // 3
-            f1 = g // 3 if g >= 0 else -1
-            if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z, least):
-                continue
-            if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z, least):
-                continue
-            points[b, 0], points[b, 1], points[b, 2] = x, y, z
-            for axis in range(3):
-                flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
-            c = corner[h2]
-            d = corner[_previous(g)] if g >= 0 else -1
-            mark = max(feature[h1], feature[h2])
-            inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
-            for i in range(faces_a):
-                corner[out_a[i]] = b
-            corner[3 * f0] = -1
-            _join(opposite, feature, outer1, outer2, mark)
-            if g >= 0:
-                corner[3 * f1] = -1
-                _join(opposite, feature, inner1, inner2, inner_mark)
-            leave[a] = -1
-            _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
-            _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
-            if g >= 0:
-                _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
-            done += 1
-            break
     return done
 
 

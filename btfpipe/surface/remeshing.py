@@ -118,11 +118,18 @@ class _Mesh:
             *self._tables(), self.kind, self.points, self.flat, self.n_faces,
             shortest, longest, least,
         )  # fmt: skip
+        self._compact()
+        return count
+
+    def collapse_of(self, faces):
+        _edges.collapse_of(*self._tables(), self.kind, self.points, self.flat, faces)
+        self._compact()
+
+    def _compact(self):
         self.n_vertices, self.n_faces = _edges.compact(
             *self._tables(), self.kind, self.place, self.along, self.origin, self.points, self.flat,
             self.n_vertices, self.n_faces,
         )  # fmt: skip
-        return count
 
     def pin(self, face, point, place):
         """Pin the nearest free corner of a face to a point of the input, or a new vertex if all are bound."""
@@ -148,10 +155,6 @@ class _Mesh:
         step = np.zeros((self.n_vertices, 3))
         _edges.relax(*self._tables(), self.kind, self.points, self.n_vertices, step)
         return self.settle(step, reach)
-
-    def stay(self):
-        """As `smooth`, but nothing moves."""
-        return self.settle(np.zeros((self.n_vertices, 3)), np.inf)
 
     def settle(self, step, reach):
         """Bring flat positions plus `step` back to the input and lift them onto the smooth surface.
@@ -274,22 +277,32 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
         face, weights = mesh.smooth(0.5 * target)
         mesh.flip(i < settle // 2)
         report(polish + i, rounds)
+    best = None
     for i in range(_MOST_MENDS + 1):
         flat, faces = mesh.flat[: mesh.n_vertices], mesh.faces()
         spacing = mean_edge(flat, faces)
         deviation = measure(flat, faces, source.vertices, source.faces, spacing)
         off = deviation.distances / spacing
-        lost = np.flatnonzero(off > _LEFT)
-        if i == _MOST_MENDS or not len(lost):
-            break
-        lost = lost[np.argsort(-off[lost], kind="stable")]
-        _pin(mesh, deviation.points[lost], deviation.place[lost], deviation.face[lost], spacing)
+        if best is None or off.max() < best[0]:
+            points = mesh.points[: mesh.n_vertices]
+            made = Resampling(*_in_order(faces, points, face, weights), spacing, deviation)
+            best = off.max(), made
+        if i == _MOST_MENDS or off.max() <= _LEFT:
+            return best[1]
+        _mend(mesh, deviation, spacing)
         for _ in range(2):
-            face, weights = mesh.smooth(0.5 * target) if i < _MOST_MENDS // 2 else mesh.stay()
+            face, weights = mesh.smooth(0.5 * target)
             mesh.flip(False)
-    points = mesh.points[: mesh.n_vertices]
-    faces, face, weights = _in_order(mesh.faces(), points, face, weights)
-    return Resampling(faces, face, weights, spacing, deviation)
+
+
+def _mend(mesh, deviation, spacing):
+    """Pin vertices to what the mesh lost of the input; where it leaves the input, it is folded, and the fold goes."""
+    lost = np.flatnonzero(deviation.distances > _LEFT * spacing)
+    lost = lost[np.argsort(-deviation.distances[lost], kind="stable")]
+    ours = lost >= len(deviation.from_input)
+    theirs = lost[~ours]
+    _pin(mesh, deviation.points[theirs], deviation.place[theirs], deviation.face[theirs], spacing)
+    mesh.collapse_of(np.unique(deviation.face[lost[ours]]))
 
 
 def _pin(mesh, points, place, face, spacing):
