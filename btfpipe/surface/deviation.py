@@ -15,7 +15,7 @@ MOST_SPACINGS = 0.5  # between the resampled mesh and its input
 MOST_SPACINGS_AT_TIPS = 1.0  # within a spacing of corners sharper than `TIP_DEG`
 TIP_DEG = 60
 _MOST_PARTS = 400  # of one edge
-_BENT_DEG = 10  # between faces of the result; flatter ones are sampled in their middle only
+_BENT_DEG = 10  # between faces; along flatter edges fewer points do
 
 
 @dataclass
@@ -74,8 +74,9 @@ class Deviation:
 def measure(vertices, faces, source_vertices, source_faces, spacing, seed=0):
     """Measure a mesh against its input by points on both.
 
-    Those on the input are its vertices, points along its edges and random ones on its faces, each about half a
-    spacing from the next. Those on the mesh are the middles of its faces and of its bent edges, and its vertices.
+    Those on the input are its vertices, random points on its faces, half a spacing from each other, and points along its
+    edges, as near, or twice as near on bent edges. Those on the mesh are the middles of its faces and of its bent
+    edges, and its vertices.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def measure(vertices, faces, source_vertices, source_faces, spacing, seed=0):
     start, end = half_edges(source_faces)
     first = np.empty(len(source_vertices), np.int64)
     first[start] = np.arange(len(start)) // 3
-    on_edges, edge = _along_edges(source_vertices, source_faces, spacing / 2)
+    on_edges, edge = _along_edges(source_vertices, source_faces, spacing)
     inside, face = _on_faces(source_vertices, source_faces, 4 * len(vertices), seed)
     theirs = np.concatenate([source_vertices, on_edges, inside])
     from_input, nearest, _ = closest(theirs, vertices, faces)
@@ -118,7 +119,7 @@ def measure(vertices, faces, source_vertices, source_faces, spacing, seed=0):
         np.concatenate([first, edge // 3, face, place]),
         np.concatenate([nearest, np.arange(len(faces)), h // 3, around]),
         float(from_input[-len(inside) :].mean()),
-        float(np.average(to_input[: len(faces)], weights=twice)),
+        float(np.average(_face_means(to_input, faces, len(vertices)), weights=twice)),
         mesh_area(vertices, faces) / mesh_area(source_vertices, source_faces),
     )
 
@@ -189,12 +190,26 @@ def _between(a, b, step):
     return (1 - fraction) * a[edge] + fraction * b[edge], edge
 
 
-def _along_edges(vertices, faces, step):
+def _face_means(distance, faces, n):
+    """Mean over each face, exact for quadratic distances, from those of its middle and its corners."""
+    corners = distance[len(distance) - n :][faces]
+    return 0.75 * distance[: len(faces)] + 0.25 * corners.mean(axis=1)
+
+
+def _along_edges(vertices, faces, spacing):
     """Points along the edges of a mesh and the half-edge of each."""
     start, end = half_edges(faces)
-    once = np.flatnonzero(np.arange(len(start)) > opposite_half_edges(faces))
-    points, edge = _between(vertices[start[once]], vertices[end[once]], step)
-    return points, once[edge]
+    opposite = opposite_half_edges(faces)
+    angle = edge_normals_angle(vertices, faces, opposite)
+    once = np.arange(len(start)) > opposite
+    points, edges = [], []
+    bent = (opposite < 0) | (angle > np.deg2rad(_BENT_DEG))
+    for chosen, step in ((bent, spacing / 4), (~bent, spacing / 2)):
+        half = np.flatnonzero(once & chosen)
+        found, edge = _between(vertices[start[half]], vertices[end[half]], step)
+        points.append(found)
+        edges.append(half[edge])
+    return np.concatenate(points), np.concatenate(edges)
 
 
 def _on_faces(vertices, faces, count, seed):

@@ -49,7 +49,7 @@ class SmoothInput:
         """Positions on the smooth surface, (k, 3) float64 (Boubekeur and Alexa 2008, eq. 3).
 
         The point is pulled towards the mean of its projections onto the tangent planes of its face's
-        corners. Unlike there the pull fades towards creases, where the two sides would part.
+        corners. Unlike there corners on creases, where the two sides would part, and on sharp edges do not pull.
         """
         flat = self.flat(face, weights)
         if self.alpha == 0:
@@ -57,9 +57,8 @@ class SmoothInput:
         corners = self.vertices[self.faces[face]]
         normals = self.corner_normals[face]
         above = np.einsum("kcx,kcx->kc", flat[:, None] - corners, normals)
-        pull = np.einsum("kc,kc,kcx->kx", weights, above, normals)
-        ease = np.einsum("kc,kc->k", weights, self.ease[self.faces[face]])
-        return flat - self.alpha * ease[:, None] * pull
+        eased = weights * self.ease[self.faces[face]]
+        return flat - self.alpha * np.einsum("kc,kc,kcx->kx", eased, above, normals)
 
     def normals(self, face, weights):
         """Unit shading normals, (k, 3) float64, interpolated from the corners."""

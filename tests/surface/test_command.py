@@ -210,7 +210,7 @@ def test_a_mesh_in_an_impossible_unit_is_refused(shapes, btfpipe, tmp_path, fact
     assert "spans" in btfpipe("info", mesh).stdout
 
 
-def test_a_spike_that_splitting_does_not_shorten_is_refused(btfpipe, tmp_path):
+def test_a_spike_keeps_its_height_and_grows_no_thicker(btfpipe, tmp_path):
     n = 4
     places = [
         (i / n, j / n, 0.1 * np.sin(i) * np.cos(j)) for i in range(n + 1) for j in range(n + 1)
@@ -223,8 +223,10 @@ def test_a_spike_that_splitting_does_not_shorten_is_refused(btfpipe, tmp_path):
             rows += [f"f {a} {a + n + 1} {a + 1}", f"f {a + 1} {a + n + 1} {a + n + 2}"]
     mesh = tmp_path / "spike.obj"
     mesh.write_text("\n".join(rows))
-    command = ["surface", mesh, "-o", tmp_path / "s.npz", "--vertices", 100, "--levels", 1]
-    assert f"{mesh}: edges are split without end" in btfpipe(*command, code=3).stderr
+    out = tmp_path / "s.npz"
+    done = btfpipe("surface", mesh, "-o", out, "--vertices", 1000, "--levels", 1, "--json")
+    assert json.loads(done.stdout)["area_ratio"] == pytest.approx(1, abs=0.01)
+    assert Surface.open(out).levels[0].vertices[:, 2].max() == pytest.approx(90.0001)
 
 
 def test_a_stroke_off_the_surface_is_refused_with_the_mesh(shapes, btfpipe, tmp_path):
