@@ -11,6 +11,7 @@ import numpy as np
 
 _TRIAL = 30_000  # vertices at most of the run that finds the length for the wanted number
 _NEAR = 0.05
+_ROUNDS = 3  # of which the nearest to the wanted number counts
 
 
 def pymeshlab(vertices, faces, length):
@@ -54,12 +55,18 @@ def main(peer, source, out, n):
     with np.load(source) as data:
         mesh = data["vertices"], data["faces"]
     n = int(n)
-    trial = min(n, _TRIAL)
-    length = length_for(*mesh, trial)
-    made = remesh(*mesh, length)
-    off = len(made[0]) / trial
-    if trial < n or abs(off - 1) > _NEAR:
-        made = remesh(*mesh, length_for(*mesh, n) * np.sqrt(off))
+    trial, scale, best = min(n, _TRIAL), 1.0, None
+    for _ in range(_ROUNDS):
+        made = remesh(*mesh, scale * length_for(*mesh, trial))
+        off = len(made[0]) / trial
+        if best is None or abs(np.log(off)) < abs(np.log(best[0])):
+            best = off, scale, made
+        if abs(off - 1) <= _NEAR:
+            break
+        scale *= np.sqrt(off)
+    off, scale, made = best
+    if trial < n:
+        made = remesh(*mesh, scale * np.sqrt(off) * length_for(*mesh, n))
     np.savez(out, vertices=made[0], faces=made[1], seconds=made[2])
 
 
