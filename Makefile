@@ -60,7 +60,7 @@ mutants: $(READY)
 
 # Peers that the benchmarks time themselves against are installed here only.
 bench: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench,test,lint]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench,peers,test,lint]"
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -s -q
 
 # Pictures and meshes beside those of other programs, which are installed here only.
