@@ -63,32 +63,28 @@ def held_out(sample, step=5):
 
     Every `step`-th light and view is left out, the outermost ring excepted.
     """
-    pictures = []
     left = []
     for directions in (sample.light_directions, sample.view_directions):
         inner = np.flatnonzero(directions[:, 2] > directions[:, 2].min() + 0.01)
         left.append(inner[step // 2 :: step])
-    lights, views = (
-        np.setdiff1d(np.arange(len(d)), out)
-        for d, out in zip((sample.light_directions, sample.view_directions), left, strict=True)
-    )
-    for light, view in ((lights, views), left):
-        pair = (view[:, None] * len(sample.light_directions) + light).ravel()
-        index = np.arange(len(pair))
-        pictures.append(
-            Sample(
-                sample.codes[pair],
-                sample.light_directions[light],
-                sample.view_directions[view],
-                index % len(light),
-                index // len(light),
-                transfer=sample.transfer,
-                absolute=sample.absolute,
-                scale=sample.scale,
-                toroidal=sample.toroidal,
-            )  # fmt: skip
+    kept = [
+        np.setdiff1d(np.arange(len(directions)), out)
+        for directions, out in zip(
+            (sample.light_directions, sample.view_directions), left, strict=True
         )
-    return pictures
+    ]
+    return grid_of(sample, *kept), grid_of(sample, *left)
+
+
+def grid_of(sample, lights, views):
+    """The Sample of some lights and views of one of a full grid."""
+    pair = (views[:, None] * len(sample.light_directions) + lights).ravel()
+    index = np.arange(len(pair))
+    return Sample(
+        sample.codes[pair], sample.light_directions[lights], sample.view_directions[views],
+        index % len(lights), index // len(lights), transfer=sample.transfer, absolute=sample.absolute,
+        scale=sample.scale, toroidal=sample.toroidal,
+    )  # fmt: skip
 
 
 class Errors:
