@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+from shared_shapes import dense_sphere
 
 from btfpipe.compression.coded import compress_coded
 from btfpipe.compression.svd import compress_svd
@@ -19,6 +20,7 @@ from btfpipe.sample import Sample, encode
 
 SIDE = 64
 RATIOS = (25, 50, 100, 200, 400)
+MOST_PICTURE = 2.0  # the same, of a whole picture
 MOST_QUERIES = 4.2  # of an SVD of 40 terms that one may cost: one and a half times what was read
 
 
@@ -123,6 +125,49 @@ def test_a_query_under_one_light_costs_few_of_an_svd_of_40_terms(benchmark):
     )
     benchmark.pedantic(shaders["coded"].shade, (*queries, out), rounds=3)
     assert ratio < MOST_QUERIES
+
+
+def picture_under_one_light(model, side):
+    """A scene of a sphere of 250,000 vertices that wears a Model."""
+    from btfpipe.rendering.camera import make_camera
+    from btfpipe.rendering.objects import dressed_surface
+    from btfpipe.rendering.scene import Film, Light, Scene
+
+    thing = dressed_surface(*dense_sphere(side), model, "barycentric")
+    camera = make_camera({"type": "perspective", "direction": [0, 0.3, 1]}, 1.0, thing.vertices)
+    light = Light(True, np.array([0.48, 0.6, 0.64]), np.full(3, np.pi))
+    return Scene(camera, Film(512, 512, 4), [light], [thing])
+
+
+def test_a_whole_picture_under_one_light_costs_little_more_than_with_an_svd(benchmark):
+    """In turns, one thread; geometry, rays and shadows are the same for both."""
+    from btfpipe.rendering.renderer import render
+
+    sample = relief_sample()
+    threads = available_threads()
+    scenes = {
+        "svd-40": picture_under_one_light(compress_svd(sample, 40, threads=threads), SIDE),
+        "coded": picture_under_one_light(compress_coded(sample, threads=threads), SIDE),
+    }
+    best, pictures = dict.fromkeys(scenes, np.inf), {}
+    for turn in range(4):
+        for name, scene in scenes.items():
+            pictures[name], time_ = seconds(lambda s=scene: render(s, threads=1))
+            if turn:  # the first compiles
+                best[name] = min(best[name], time_)
+    ratio = best["coded"] / best["svd-40"]
+    benchmark.extra_info.update(best, ratio=ratio)
+    say(
+        f"512 x 512 pixels, 4 rays each, 250,000 vertices, one light, sample {SIDE} x {SIDE}: "
+        + ", ".join(f"{name} {t:.2f} s" for name, t in best.items())
+        + f", ratio {ratio:.2f}"
+    )
+    benchmark.pedantic(lambda: None, rounds=1)
+    covered = pictures["coded"][..., 3] > 0
+    assert covered.mean() > 0.5
+    means = [picture[covered, :3].mean() for picture in pictures.values()]
+    assert abs(means[1] / means[0] - 1) < 0.05
+    assert ratio < MOST_PICTURE
 
 
 def test_more_decibels_at_equal_bytes(benchmark, tmp_path):

@@ -6,13 +6,12 @@ import time
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
+from shared_shapes import dense_sphere
 
 from btfpipe.compression.svd import SvdModel
 from btfpipe.directions import bonn81, from_angles
 from btfpipe.parallel import available_threads, single_threaded_blas
 from btfpipe.sample import Sample, light_cosines
-from btfpipe.surface.surface import Level
-from btfpipe.synthesis import CoordinateMap
 
 SIDE, TERMS, POINTS, BLOCK = 128, 40, 200_000, 10_000
 
@@ -168,34 +167,13 @@ def test_interpolations_per_second(benchmark):
     benchmark.pedantic(shader.shade, (row, col, w_i, w_o, out), rounds=1)
 
 
-def _dense_sphere(rings=500, segments=500):
-    """A unit sphere of 250,000 vertices up to 60 degrees of latitude, tangents to the east, and a map along both."""
-    lat, lon = np.meshgrid(
-        np.linspace(np.pi / 3, -np.pi / 3, rings),
-        np.linspace(-np.pi, np.pi, segments, endpoint=False),
-        indexing="ij",
-    )
-    vertices = np.stack([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)], -1)
-    east = np.stack([np.cos(lon), 0 * lon, -np.sin(lon)], -1)
-    a = np.arange(rings * segments).reshape(rings, segments)
-    b = np.roll(a, -1, axis=1)
-    faces = np.concatenate(
-        [np.stack([a[:-1], a[1:], b[1:]], -1), np.stack([a[:-1], b[1:], b[:-1]], -1)]
-    ).reshape(-1, 3)
-    vertices, east = vertices.reshape(-1, 3), east.reshape(-1, 3).astype(np.float32)
-    level = Level(vertices, faces.astype(np.int32), vertices.astype(np.float32), east)
-    per_unit = 4 * SIDE / (2 * np.pi)  # the sample four times around
-    row, col = (-lat * per_unit) % SIDE, (lon * per_unit) % SIDE
-    return level, CoordinateMap(row.ravel(), col.ravel(), 0 * row.ravel(), per_unit, {})
-
-
 def test_whole_picture_of_a_dense_surface(benchmark):
     from btfpipe.rendering.camera import make_camera
     from btfpipe.rendering.objects import dressed_surface
     from btfpipe.rendering.renderer import render
     from btfpipe.rendering.scene import Film, Light, Scene
 
-    level, coordinates = _dense_sphere()
+    level, coordinates = dense_sphere(SIDE)
     thing = dressed_surface(level, coordinates, _material("svd"), "barycentric")
     camera = make_camera({"type": "perspective", "direction": [0, 0.3, 1]}, 1.0, thing.vertices)
     light = Light(True, np.array([0.48, 0.6, 0.64]), np.full(3, np.pi))

@@ -83,3 +83,46 @@ class NaiveRoots:
         pairs = (view[0][:, None] * len(model.light_directions) + light[0]).ravel()
         weight = np.multiply.outer(view[1], light[1]).ravel()
         return pairs, weight, np.sqrt(gain(of_lights, light[1]) * gain(of_views, view[1]))
+
+
+class NaivePictures:
+    """Blends an `Appearance`'s own pictures between its directions, in whole pictures, by the definition alone.
+
+    Parameters
+    ----------
+    appearance : Appearance
+        A full grid of views and lights.
+    """
+
+    ways = ("values", "roots alone", "roots, brightness kept")
+
+    def __init__(self, appearance):
+        lights, views = appearance.light_directions, appearance.view_directions
+        self.hemispheres = Hemisphere(lights), Hemisphere(views)
+        self.values = np.array(appearance.pictures(slice(0, appearance.n_pairs)), float)
+        self.values = self.values.reshape(len(views), len(lights), *appearance.shape, 3)
+        self.values /= np.maximum(lights[:, 2], 0.01)[:, None, None, None]
+        self.roots = np.sqrt(np.abs(self.values)) * np.sign(self.values)
+        flat = self.roots.reshape(len(views), len(lights), -1)
+        self.of_lights = sum(seen @ seen.T for seen in flat)
+        self.of_views = sum(lit @ lit.T for lit in flat.swapaxes(0, 1))
+
+    def __call__(self, w_i, w_o):
+        """Pictures (rows, cols, 3) under a light and from a view, by the name of the way of blending."""
+        light, view = (
+            [a[0] for a in hemisphere.weights(w[None])]
+            for hemisphere, w in zip(self.hemispheres, (w_i, w_o), strict=True)
+        )
+        weight = np.multiply.outer(view[1], light[1])
+        at = np.ix_(view[0], light[0])
+        values, root = (np.tensordot(weight, a[at], 2) for a in (self.values, self.roots))
+        gain = np.sqrt(_gain_of(self.of_lights, *light) * _gain_of(self.of_views, *view))
+        squared = root * np.abs(root)
+        blended = (values, squared, gain * squared)
+        return {name: w_i[2] * a for name, a in zip(self.ways, blended, strict=True)}
+
+
+def _gain_of(products, index, weight):
+    """As `gain`, of vectors whose scalar products are given."""
+    products = products[np.ix_(index, index)]
+    return (weight @ products.diagonal()) / (weight @ products @ weight)

@@ -169,3 +169,34 @@ def hedgehog():
     centre = np.stack([np.cos(u), 0 * u, -np.sin(u)], axis=1)
     spike = np.maximum(np.cos(8 * u) * np.cos(2 * w), 0) ** 40
     return centre + (vertices - centre) * (1 + 2 * spike)[:, None], faces
+
+
+def dense_sphere(side, rings=500, segments=500):
+    """A unit sphere of 250,000 vertices up to 60 degrees of latitude, and a sample of `side` texels laid four times around it.
+
+    Returns
+    -------
+    Level
+        Tangents to the east.
+    CoordinateMap
+    """
+    from btfpipe.surface.surface import Level
+    from btfpipe.synthesis import CoordinateMap
+
+    lat, lon = np.meshgrid(
+        np.linspace(np.pi / 3, -np.pi / 3, rings),
+        np.linspace(-np.pi, np.pi, segments, endpoint=False),
+        indexing="ij",
+    )
+    vertices = np.stack([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)], -1)
+    east = np.stack([np.cos(lon), 0 * lon, -np.sin(lon)], -1)
+    a = np.arange(rings * segments).reshape(rings, segments)
+    b = np.roll(a, -1, axis=1)
+    faces = np.concatenate(
+        [np.stack([a[:-1], a[1:], b[1:]], -1), np.stack([a[:-1], b[1:], b[:-1]], -1)]
+    ).reshape(-1, 3)
+    vertices, east = vertices.reshape(-1, 3), east.reshape(-1, 3).astype(np.float32)
+    level = Level(vertices, faces.astype(np.int32), vertices.astype(np.float32), east)
+    per_unit = 4 * side / (2 * np.pi)  # the sample four times around
+    row, col = (-lat * per_unit) % side, (lon * per_unit) % side
+    return level, CoordinateMap(row.ravel(), col.ravel(), 0 * row.ravel(), per_unit, {})
