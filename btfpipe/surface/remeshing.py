@@ -23,7 +23,7 @@ from btfpipe.surface.topology import (
 )
 
 _TOO_LONG, _TOO_SHORT = 4 / 3, 4 / 5
-_MORE_ROUNDS = 6
+_MORE_ROUNDS = 12
 _HELD, _LEFT = 0.3, 0.4  # spacings that a point of the input may lie off, on the way and in the end
 _MOST_MENDS = 8
 _MOST_REVERTS = 3
@@ -270,8 +270,8 @@ def resample(source, n_vertices, report=lambda done, total: None, polish=5, sett
         off = mesh.n_vertices / n_vertices
         if i + 1 >= polish and abs(off - 1) < 0.02:
             break
-        # aim at the wanted number; edges between too short and too long stay, so aim beyond
-        target *= np.clip(off, 0.8, 1.25)
+        # aim at the wanted number; edges between too short and too long stay, so aim beyond at first
+        target *= np.clip(off, 0.8, 1.25) if i < polish else np.clip(off, 0.9, 1.1) ** 0.5
         report(min(i, polish), rounds)
     for i in range(settle):
         face, weights = mesh.smooth(0.5 * target)
