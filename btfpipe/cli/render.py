@@ -42,13 +42,20 @@ def _bindings(context, parameter, values):
     "--samples", type=click.IntRange(1, MOST_SAMPLES), help="Rays a pixel, instead of the scene's."
 )
 @click.option(
+    "--texture-filter/--no-texture-filter",
+    default=None,
+    help="Whether Samples and Models are averaged over what a ray covers of them, instead of as the scene says (by default yes).",
+)
+@click.option(
     "--float",
     "full",
     is_flag=True,
     help="Store all layers as 32-bit floats; otherwise colours, alpha and normals are 16-bit, unless radiance exceeds those.",
 )
 @stage()
-def render(scene, bindings, width, height, samples, full, out, seed, threads, memory, quiet):
+def render(
+    scene, bindings, width, height, samples, texture_filter, full, out, seed, threads, memory, quiet
+):  # fmt: skip
     """Make a picture of a scene: dressed surfaces under lights, as OpenEXR.
 
     SCENE is a YAML file with camera, film, lights and objects. Layers of the picture: colour and alpha (R G B A,
@@ -71,7 +78,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
 
     if Path(out).suffix.lower() != ".exr":
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
-    film = {"width": width, "height": height, "samples": samples}
+    film = {"width": width, "height": height, "samples": samples, "texture_filter": texture_filter}
     start = time.perf_counter()
     loaded = load_scene(
         scene,

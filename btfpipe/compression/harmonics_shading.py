@@ -14,6 +14,7 @@ from btfpipe.sample.shading import corners
 
 FAST = {"contract", "reassoc", "nsz"}
 MANY_LIGHTS = 2
+_FINER = 257  # codes of 16 bits to one of 8
 
 
 class HarmonicsShader:
@@ -36,6 +37,15 @@ class HarmonicsShader:
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
         self.slice_bytes = slice_bytes(model.light_terms)
+
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`: codes of 16 bits, as means of codes lie between them."""
+        codes, scale = halving(self.codes), 1
+        if self.codes.dtype == np.uint8:
+            scale = _FINER
+            codes *= np.float32(scale)
+        codes = np.rint(codes, out=codes).astype(np.uint16)
+        return halving.coarser(self, codes=codes, step=self.step / np.float32(scale))
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -66,15 +76,15 @@ class HarmonicSlices:
 
     def __init__(self, shader, row, col, w_o):
         self.table = shader.light_table
-        self.coefficients = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
+        self.values = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
         _slice(
             shader.codes, shader.minimum, shader.step, shader.view_table, shader.rows, shader.cols, shader.toroidal,
-            row, col, lifted(w_o), self.coefficients,
+            row, col, lifted(w_o), self.values,
         )  # fmt: skip
 
     def shade(self, chosen, w_i, out):
         """Fill `out`; see `Appearance.shader`."""
-        _sum(self.coefficients, self.table, chosen, w_i, out)
+        _sum(self.values, self.table, chosen, w_i, out)
 
 
 @leaf(fastmath=FAST)

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from btfpipe.sample.light_slices import LightSlices
 from btfpipe.sample.shading import PairShader, corners
 
 
@@ -23,6 +24,20 @@ class SvdShader(PairShader):
         n = model.n_terms
         self.texture = np.ascontiguousarray(model.texture_factors, np.float32).reshape(-1, n)
         self.angular = np.ascontiguousarray(model.angular_factors, np.float32).reshape(-1, 3 * n)
+
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`."""
+        return halving.coarser(self, texture=halving(self.texture))
+
+    def slices(self, row, col, w_o):
+        """See `Appearance.shader`; no faster than `shade`, but to be averaged with those of slower shaders."""
+        return LightSlices(self, row, col, w_o)
+
+    def seen(self, texels, view):
+        """Values (n, lights, 3) float32 of texels (n,) from a measured view under every measured light."""
+        lights, n = len(self.pairs.inverse_cosines), self.texture.shape[1]
+        angular = self.angular[view * lights : (view + 1) * lights].reshape(-1, n)
+        return (self.texture[texels] @ angular.T).reshape(len(texels), lights, 3)
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""

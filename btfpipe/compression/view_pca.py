@@ -332,6 +332,10 @@ class ViewPcaShader(PairShader):
         self.weights = np.ascontiguousarray(model.weights, np.float32).reshape(-1, terms)
         self.lights = model.weights.shape[1]
 
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`."""
+        return halving.coarser(self, textures=halving(self.textures))
+
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
         # pairs of one view follow each other, or, the nearest in light-view space, stand alone

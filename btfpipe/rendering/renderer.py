@@ -6,6 +6,7 @@ from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.clearance import clearance
+from btfpipe.rendering.footprint import Footprints, film_offsets, film_steps, strata_moments
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
@@ -26,6 +27,13 @@ def _is_sliced(thing, lights):
     many = getattr(thing.dressing.shader, "many_lights", None)
     lights = [light for light in lights if light.environment not in thing.dressing.skies]
     return many is not None and len(lights) >= many
+
+
+def _of_points(target, chosen, n):
+    """Which look-ups, by their points `target`, are of some of the n points."""
+    wanted = np.zeros(n, bool)
+    wanted[chosen] = True
+    return np.flatnonzero(wanted[target])
 
 
 class Renderer:
@@ -60,6 +68,8 @@ class Renderer:
             if _is_sliced(thing, scene.lights)
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
+        rows, cols = strata(scene.film.samples)
+        self.moments = strata_moments(self.table, cols), strata_moments(self.table, rows)
         # single precision positions are this far off at the scene's size
         self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
         self.tree = EmbreeScene(robust=True)
@@ -97,6 +107,7 @@ class Renderer:
         points.pixels = (
             (y + pixel // width) * film.width + x + pixel % width
         ) * film.samples + sample
+        points.footprints = self._footprints(points, found["primID"], directions)
         radiance = np.zeros((len(hits), 3))
         if len(hits):
             slices = {number: self._slice(number, points) for number in self.sliced}
@@ -104,7 +115,7 @@ class Renderer:
                 self._add_light(light, points, slices, radiance)
             for number, thing in enumerate(self.scene.objects):
                 if thing.dressing is not None and thing.dressing.skies:
-                    self._add_skies(thing, np.flatnonzero(points.thing == number), points, radiance)
+                    self._add_skies(number, points, radiance)
         picture = np.empty((width * height, len(LAYERS)))
         # depth along the camera's axis, as compositing programs expect it
         depth = points.depth * (directions[hits] @ camera.axes[2])
@@ -135,7 +146,10 @@ class Renderer:
         """Slices of all look-ups of an object, and the point of each."""
         thing = self.scene.objects[number]
         mine = np.flatnonzero(points.thing == number)
-        row, col, _, at_o, _, target = self._look_up(thing, mine, points, points.toward_eye)
+        row, col, _, at_o, _, target, _ = self._look_up(thing, mine, points, points.toward_eye)
+        filtered = points.footprints[number]
+        if filtered is not None:
+            return filtered.slices(at_o), target
         return self.sliced[number].slices(row, col, at_o), target
 
     def _add_light(self, light, points, slices, radiance):
@@ -157,19 +171,22 @@ class Renderer:
                 kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
             elif len(mine) and light.environment not in thing.dressing.skies:
                 lookups = self._look_up(thing, mine, points, w_i)
-                row, col, at_i, at_o, blend, target = lookups
+                row, col, at_i, at_o, blend, target, _ = lookups
                 values = np.empty_like(at_i)
+                filtered = points.footprints[number]
                 if number in slices:
                     sliced, belongs = slices[number]
-                    wanted = np.zeros(n, bool)
-                    wanted[mine] = True
-                    sliced.shade(np.flatnonzero(wanted[belongs]), at_i, values)
+                    sliced.shade(_of_points(belongs, mine, n), at_i, values)
+                elif filtered is not None:
+                    filtered.shade(_of_points(filtered.target, mine, n), at_i, at_o, values)
                 else:
                     thing.dressing.shader.shade(row, col, at_i, at_o, values)
                 kernels.add_lookups(values, blend, target, irradiance, radiance)
 
-    def _add_skies(self, thing, mine, points, radiance):
+    def _add_skies(self, number, points, radiance):
         """Add the light of environments that one object takes in the frequency domain."""
+        thing, filtered = self.scene.objects[number], points.footprints[number]
+        mine = np.flatnonzero(points.thing == number)
         if not len(mine):
             return
         n = len(points.hits)
@@ -177,7 +194,7 @@ class Renderer:
         frames = []
         for axis in np.eye(3):
             along = np.ascontiguousarray(np.broadcast_to(axis, (n, 3)))
-            row, col, at_i, at_o, blend, target = self._look_up(thing, mine, points, along)
+            row, col, at_i, at_o, blend, target, _ = self._look_up(thing, mine, points, along)
             frames.append(at_i)
         frames = np.ascontiguousarray(np.stack(frames, axis=2))
         values, full = np.empty_like(at_o), np.full((n, 3), np.pi)
@@ -185,7 +202,10 @@ class Renderer:
             visibility = np.ones(n, np.float32)
             if sky.occlusion_rays:
                 visibility[mine] = self._open_share(points, mine, sky.occlusion_rays)
-            sky.shade(row, col, frames, at_o, values, visibility[target])
+            if filtered is not None:
+                filtered.shade_sky(sky, frames, at_o, values, visibility[target])
+            else:
+                sky.shade(row, col, frames, at_o, values, visibility[target])
             kernels.add_lookups(values, blend, target, full, radiance)
 
     def _open_share(self, points, mine, rays):
@@ -205,13 +225,52 @@ class Renderer:
         n = kernels.count_lookups(lit, points.face, dress.weight, dress.coherent)
         row, col, blend = (np.empty(n, np.float32) for _ in range(3))
         at_i, at_o = (np.empty((n, 3), np.float32) for _ in range(2))
-        target = np.empty(n, np.int64)
+        target, corner = np.empty(n, np.int64), np.empty(n, np.int8)
         n = kernels.gather_lookups(
             lit, points.face, points.share, points.normal, points.facing, points.toward_eye, w_i,
             thing.faces, dress.row, dress.col, dress.weight, dress.axis, dress.coherent,
-            dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target,
+            dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target, corner,
         )  # fmt: skip
-        return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target))
+        return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target, corner))
+
+    def _footprints(self, points, prim, directions):
+        """The `Footprints` of each object's look-ups at all its points; None where nothing is filtered."""
+        found = [None] * len(self.scene.objects)
+        filtered = [
+            number
+            for number, thing in enumerate(self.scene.objects)
+            if thing.dressing is not None and thing.dressing.pyramid is not None
+        ]
+        if not filtered or not len(points.hits):
+            return found
+        n = len(points.hits)
+        film, camera = self.scene.film, self.scene.camera
+        over = np.empty((n, 3)), np.empty((n, 3))
+        film_steps(
+            points.hits, prim, directions, points.depth, self.vertices, self.faces, camera.axes,
+            2 * camera.extent[0] / film.width, -2 * camera.extent[1] / film.height, camera.perspective,
+            *over,
+        )  # fmt: skip
+        rows, cols = strata(film.samples)
+        shift, variance = np.empty((n, 2)), np.empty((n, 2))
+        (mean_x, variance_x), (mean_y, variance_y) = self.moments
+        film_offsets(
+            points.pixels, rows, cols, self.table, self.seed, mean_x, mean_y, shift
+        )
+        stratum = points.pixels % film.samples
+        variance[:, 0], variance[:, 1] = variance_x[stratum % cols], variance_y[stratum // cols]
+        for number in filtered:
+            thing = self.scene.objects[number]
+            mine = np.flatnonzero(points.thing == number)
+            row, col, at_x, _, _, target, corner = self._look_up(thing, mine, points, over[0])
+            at_y = self._look_up(thing, mine, points, over[1])[2]
+            made = Footprints(
+                thing.dressing.pyramid, row, col, target, corner, at_x, at_y,
+                thing.dressing.texels_per_unit, shift, variance,
+            )  # fmt: skip
+            if not made.points:
+                found[number] = made
+        return found
 
 
 class Points:

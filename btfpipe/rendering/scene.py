@@ -15,13 +15,14 @@ from btfpipe.rendering.memory import parts_of_scene, plan_threads
 
 @dataclass
 class Film:
-    """Pixels across and down, rays a pixel, and the filter that gathers them (radius in pixels)."""
+    """Pixels across and down, rays a pixel, the filter that gathers them (radius in pixels), and whether textures are filtered."""
 
     width: int = 512
     height: int = 512
     samples: int = 16
     filter: str = "gaussian"
     radius: float = 1.5
+    texture_filter: bool = True
 
 
 @dataclass
@@ -112,7 +113,9 @@ def load_scene(
         camera is inside an object.
     """
     description = read_description(path, bindings)
-    settings = description.get("film", {}) | {k: v for k, v in (film or {}).items() if v}
+    settings = description.get("film", {}) | {
+        k: v for k, v in (film or {}).items() if v is not None
+    }
     settings.setdefault("filter", "gaussian")
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
@@ -129,7 +132,7 @@ def load_scene(
             parts = parts_of_scene(description, film, once, read_mesh, read_picture)
             threads = plan_threads(*parts, threads, memory)
         lights, environments, skies = [], [], {}
-        things, grounds, files = [], [], []
+        things, grounds, files, pyramids = [], [], [], {}
         for number, light in enumerate(description["lights"]):
             if light["type"] == "environment":
                 files.append(light["map"])
@@ -154,6 +157,8 @@ def load_scene(
             with naming_entry("objects", number):
                 thing = _thing(entry, once, read_mesh)
                 things.append(objects.transformed(thing, entry.get("transform")))
+                if film.texture_filter and thing.dressing is not None:
+                    thing.dressing.pyramid = _pyramid(pyramids, entry, thing.dressing, threads)
         for number, sky in skies.items():
             with naming_entry("lights", number):
                 _add_sky(things, *sky)
@@ -239,6 +244,22 @@ def _add_sky(things, number, environment, light):
 def _material(once, entry):
     appearance = once(open_appearance, entry["model"])
     return once(choose_material, appearance, entry.get("material"), entry["model"])
+
+
+def _pyramid(pyramids, entry, dressing, threads):
+    """Levels of detail of what an object wears; objects of one Model share them."""
+    from btfpipe.rendering.pyramid import Pyramid
+
+    key = id(dressing.shader)
+    if key not in pyramids:
+        pyramids[key] = Pyramid(
+            dressing.model,
+            dressing.shader,
+            entry.get("interpolation", "barycentric"),
+            name=entry["model"],
+            threads=threads,
+        )
+    return pyramids[key]
 
 
 def _thing(entry, once, read_mesh):

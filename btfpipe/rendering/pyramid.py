@@ -1,0 +1,256 @@
+"""The levels of detail of an `Appearance`: its texels averaged in linear values, halving by halving.
+
+Level 0 is the shader itself. A texel of level l + 1 is the mean of the 2 x 2 texels of level l that it stands for, so that a
+coordinate x of level 0 is at (x + 0.5) / 2^l - 0.5 (Williams, *Pyramidal parametrics*, 1983). Sides that are odd
+give ``(n + 1) // 2`` texels, each the mean of the n / ((n + 1) // 2) texels that it covers, some in part.
+
+Where values are linear in the texels' factors the factors are averaged (`halved` of the shader). Roots, logarithms, clusters and
+display values are not: there the decoded pictures are averaged, and one SVD of them holds level 1 in linear values; its factors
+give the levels above.
+"""
+
+import copy
+import math
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+
+from btfpipe.compiled import leaf
+from btfpipe.errors import InputError
+
+ERROR_BOUND = 0.01  # RMS of an SVD's error over the RMS of the averaged values
+FIRST_TERMS = 48  # of that SVD; doubled until it is within the bound
+
+
+def halved_shape(shape):
+    """Rows and cols of the next level."""
+    return tuple((n + 1) // 2 for n in shape)
+
+
+def count_levels(shape):
+    """Levels from the sample down to a single texel."""
+    return 1 + math.ceil(math.log2(max(shape)))
+
+
+def share_above(shape):
+    """Texels of all levels above 0, over those of level 0."""
+    total, level = 0, shape
+    while max(level) > 1:
+        level = halved_shape(level)
+        total += math.prod(level)
+    return total / math.prod(shape)
+
+
+class Halving:
+    """Averages what the texels of a level hold into what those of the next hold.
+
+    Parameters
+    ----------
+    shape : (int, int)
+    toroidal : bool
+    weight : (rows, cols) float64, optional
+        How much each texel counts, such as 0 where it was not measured; all alike by default.
+
+    Attributes
+    ----------
+    halved : (int, int)
+        Shape of the next level.
+    weight_above : (rows, cols) float64
+        Its texels' weights. Those of weight 0 repeat the nearest texel with some.
+    """
+
+    def __init__(self, shape, toroidal, weight=None):
+        self.shape = shape
+        self.halved = halved_shape(shape)
+        self.weight = np.ones(shape) if weight is None else weight
+        total = np.empty((1, math.prod(self.halved), 1))
+        one = np.ones((1, math.prod(shape), 1), np.float32)
+        _halve(one, *self._sizes(), self.weight, total, np.zeros_like(total, np.float32))
+        self.weight_above = total.reshape(self.halved)
+        self.nearest = None
+        if not self.weight_above.all():
+            self.nearest = _nearest(self.weight_above > 0, toroidal)
+
+    def _sizes(self):
+        return (*self.shape, *self.halved)
+
+    def __call__(self, values):
+        """Average (rows * cols, ...) into float32 of as many texels as the next level has."""
+        return self.pictures(values[None])[0]
+
+    def pictures(self, values):
+        """Average (n, rows * cols, ...) into float32 (n, texels of the next level, ...)."""
+        n, texels = values.shape[:2]
+        out = np.empty((n, math.prod(self.halved), math.prod(values.shape[2:])), np.float32)
+        total = np.empty((1, out.shape[1], 1))
+        _halve(values.reshape(n, texels, -1), *self._sizes(), self.weight, total, out)
+        if self.nearest is not None:
+            out = out[:, self.nearest]
+        return out.reshape(n, -1, *values.shape[2:])
+
+    def coarser(self, shader, **factors):
+        """The shader of the next level: the same as that of this one, but for its shape and some arrays (texels, ...)."""
+        other = copy.copy(shader)
+        other.rows, other.cols = self.halved
+        for name, array in factors.items():
+            setattr(other, name, array)
+        return other
+
+
+@leaf
+def _halve(values, rows, cols, half_rows, half_cols, weight, total, out):
+    """Fill `out` (n, texels, k) with weighted means, 0 where nothing has weight, and `total` (1, texels, 1) with the weights."""
+    for i in range(half_rows):
+        # from edge to edge; a whole texel is one unit
+        top = i * rows / half_rows
+        bottom = (i + 1) * rows / half_rows
+        for j in range(half_cols):
+            left = j * cols / half_cols
+            right = (j + 1) * cols / half_cols
+            at = i * half_cols + j
+            whole = 0.0
+            for y in range(int(top), min(int(np.ceil(bottom - 1e-9)), rows)):
+                high = min(bottom, y + 1.0) - max(top, float(y))
+                for x in range(int(left), min(int(np.ceil(right - 1e-9)), cols)):
+                    wide = min(right, x + 1.0) - max(left, float(x))
+                    whole += high * wide * weight[y, x]
+            total[0, at, 0] = whole
+            out[:, at] = np.float32(0)
+            if whole <= 0.0:
+                continue
+            for y in range(int(top), min(int(np.ceil(bottom - 1e-9)), rows)):
+                high = min(bottom, y + 1.0) - max(top, float(y))
+                for x in range(int(left), min(int(np.ceil(right - 1e-9)), cols)):
+                    wide = min(right, x + 1.0) - max(left, float(x))
+                    share = np.float32(high * wide * weight[y, x] / whole)
+                    for p in range(values.shape[0]):
+                        for k in range(values.shape[2]):
+                            out[p, at, k] += share * np.float32(values[p, y * cols + x, k])
+
+
+def _nearest(valid, toroidal):
+    """Number of the nearest valid texel (texels,), its own where it is valid; the first where none is."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not valid.any():
+        return np.zeros(valid.size, np.int64)
+    pad = [n if toroidal else 0 for n in valid.shape]
+    invalid = np.pad(~valid, [(n, n) for n in pad], "wrap")
+    index = distance_transform_edt(invalid, return_distances=False, return_indices=True)
+    inside = tuple(slice(n, n + size) for n, size in zip(pad, valid.shape, strict=True))
+    row, col = (
+        (i[inside] - n) % size for i, n, size in zip(index, pad, valid.shape, strict=True)
+    )
+    return (row * valid.shape[1] + col).ravel()
+
+
+class Pyramid:
+    """Shaders of all levels, made when they are first asked for.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    shader : object
+        Its own, level 0.
+    interpolation : str
+        See `Appearance.evaluate`; the same on all levels.
+    weight : (rows, cols) float64, optional
+        See `Halving`.
+    name : str
+        What messages call the appearance.
+    threads : int
+        That make the levels; never changes them.
+
+    Attributes
+    ----------
+    nbytes : int
+        Of the levels above 0, once they are made.
+    seconds : float
+        That making them took.
+    facts : dict
+        ``terms`` and ``relative_error`` of the SVD, where there is one.
+    """
+
+    def __init__(self, appearance, shader, interpolation, *, weight=None, name="", threads=1):
+        self.appearance, self.interpolation, self.name = appearance, interpolation, name
+        self.threads = threads
+        self.weight = weight
+        self.nbytes, self.seconds, self.facts = 0, 0.0, {}
+        self.top = count_levels(appearance.shape) - 1
+        self._levels = [shader]
+        self._lock = threading.Lock()
+
+    @property
+    def made(self):
+        """Whether any level above 0 was asked for."""
+        return len(self._levels) > 1
+
+    def level(self, number):
+        """The shader of a level, at most `top`."""
+        if number and not self.made:
+            with self._lock:
+                if not self.made:
+                    start = time.perf_counter()
+                    self._levels = self._make()
+                    self.seconds = time.perf_counter() - start
+        return self._levels[number]
+
+    def _make(self):
+        levels, weight = self._levels[:], self.weight
+        toroidal = bool(self.appearance.toroidal)
+        for _ in range(self.top):
+            below = levels[-1]
+            halving = Halving((below.rows, below.cols), toroidal, weight)
+            if hasattr(below, "halved"):
+                made = below.halved(halving)
+            else:
+                made = self._factorised(halving)
+            self.nbytes += _own_bytes(made, below)
+            levels.append(made)
+            weight = halving.weight_above
+        return levels
+
+    def _factorised(self, halving):
+        """Level 1 as an SVD of the averaged pictures.
+
+        Raises
+        ------
+        InputError
+            If its error is beyond the bound with all terms that single precision tells apart.
+        """
+        from btfpipe.compression.svd import SvdModel, factorise
+
+        source = self.appearance
+        level = SimpleNamespace(shape=halving.halved, n_pairs=source.n_pairs)
+
+        def rows(_, pairs):
+            pictures = source.pictures(pairs)
+            pictures = halving.pictures(pictures.reshape(len(pictures), -1, 3))
+            return np.ascontiguousarray(pictures.transpose(0, 2, 1)).reshape(3 * len(pictures), -1)
+
+        terms, most = FIRST_TERMS, min(math.prod(halving.halved), 3 * source.n_pairs)
+        while True:
+            texture, angular, facts = factorise(
+                level, terms, rows=rows, iterations=0, precision="single", threads=self.threads,
+                memory=1 << 62,
+            )  # fmt: skip
+            if facts["relative_error"] <= ERROR_BOUND or terms >= most:
+                break
+            terms *= 2
+        self.facts = {"terms": facts["n_terms"], "relative_error": facts["relative_error"]}
+        if facts["relative_error"] > ERROR_BOUND:
+            raise InputError(
+                f"{self.name}: its averaged texels are off by {100 * facts['relative_error']:.2g} % with all terms;"
+                f" expected at most {100 * ERROR_BOUND:g} %. Render with --no-texture-filter."
+            )
+        model = SvdModel(texture.reshape(*halving.halved, -1), angular, source)
+        return model.shader(self.interpolation)
+
+
+def _own_bytes(shader, below):
+    """Bytes of the arrays that a shader does not share with the one below."""
+    kept = {id(array) for array in vars(below).values()}
+    arrays = (a for a in vars(shader).values() if isinstance(a, np.ndarray))
+    return sum(a.nbytes for a in arrays if id(a) not in kept)
