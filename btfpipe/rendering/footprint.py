@@ -22,19 +22,33 @@ from btfpipe.parallel import blocks
 
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
 PROBES = 1 << 14  # evaluated at a time
-_LEAST = 0.03  # variance of a footprint, in texels squared, up to which it is a point; whole from twice that on
+_LEAST = 0.04  # variance of a pixel, in texels squared, up to which it is a point; whole from twice that on
+_LEAST_PARTS = 2  # of a filter along each axis
+_ADDED = 5 / 12  # variance of level l: so often 4^l - 1
+_TEXEL = 1 / 12  # variance that a texel of level 0 stands for
+_WIDER = 1.0  # variance of a probe to that of what it stands for, so that neighbouring ones leave no gap
+_ROOM = 0.5  # at most so much of a pixel's variance is a probe's own
+_RAMP0, _RAMP1 = 0.2, 0.4
 _STEPS = 256  # of a stratum's integrals
 _GRAZING = 1e-3  # cosine at which a tangent plane is seen from the side
 
 
-def strata_moments(table, count):
-    """Means and variances (count,) float64, in pixels, of the strata of a filter; see `camera.filter_table`."""
-    if count == 1:
-        at = (np.arange(len(table) * 4) + 0.5) / (len(table) * 4)
-    else:
-        at = (np.arange(count * _STEPS) + 0.5) / (count * _STEPS)
-    offsets = np.interp(at * (len(table) - 1), np.arange(len(table)), table).reshape(count, -1)
-    return offsets.mean(axis=1), offsets.var(axis=1)
+def strata_means(table, count):
+    """Means (count, parts) float64 of the parts of a filter's strata, in pixels; see `camera.filter_table`.
+
+    A ray stands for its stratum, or for as many equal parts of it as make at least `_LEAST_PARTS` along the axis.
+    """
+    parts = -(-_LEAST_PARTS // count)
+    steps = max(_STEPS, 4 * len(table) // (count * parts))
+    at = (np.arange(count * parts * steps) + 0.5) / (count * parts * steps)
+    offsets = np.interp(at * (len(table) - 1), np.arange(len(table)), table)
+    return offsets.reshape(count, parts, steps).mean(axis=2)
+
+
+def filter_variance(table):
+    """Variance of a filter, in pixels squared."""
+    at = (np.arange(8 * len(table)) + 0.5) / (8 * len(table)) * (len(table) - 1)
+    return float(np.interp(at, np.arange(len(table)), table).var())
 
 
 @njit(cache=True, nogil=True)
@@ -88,69 +102,73 @@ def film_steps(
 
 
 @njit(cache=True, nogil=True)
-def film_offsets(pixels, rows, cols, table, seed, mean_x, mean_y, shift):
-    """From each ray to the mean of its stratum, in pixels (n, 2) float64; rays as `kernels.camera_rays` makes them."""
+def film_offsets(pixels, rows, cols, table, seed, offset, stratum):
+    """Offset (n, 2) float64 of rays in their pixels, and its strata (n, 2) int64; rays as `kernels.camera_rays` makes them."""
     samples = rows * cols
     last = len(table) - 1
     for h in range(len(pixels)):
-        if samples == 1:
-            shift[h, :] = 0.0
-            continue
         s = pixels[h] % samples
-        u = (s % cols + uniform(seed, pixels[h], 0)) / cols
-        v = (s // cols + uniform(seed, pixels[h], 1)) / rows
-        i = min(int(u * last), last - 1)
-        j = min(int(v * last), last - 1)
-        shift[h, 0] = mean_x[s % cols] - table[i] - (u * last - i) * (table[i + 1] - table[i])
-        shift[h, 1] = mean_y[s // cols] - table[j] - (v * last - j) * (table[j + 1] - table[j])
+        stratum[h, 0] = s % cols
+        stratum[h, 1] = s // cols
+        for axis in range(2):
+            u = 0.5
+            if samples > 1:
+                u = (stratum[h, axis] + uniform(seed, pixels[h], axis)) / (rows if axis else cols)
+            i = min(int(u * last), last - 1)
+            offset[h, axis] = table[i] + (u * last - i) * (table[i + 1] - table[i])
 
 
 @leaf
-def choose_probes(vxx, vxy, vyy, top, out):
-    """Level, share of the level above, number of probes and the step (row, col) between them: fill `out` (5,) float64.
+def choose_probes(wxx, wxy, wyy, room, top, out):
+    """Level, share of the level above, probes, and the step (row, col) between them: fill `out` (6,), variance of a probe last.
 
-    The footprint's variances `vxx` (rows), `vyy` (cols) and covariance `vxy` are in texels squared; `top` is the coarsest level.
+    Parameters
+    ----------
+    wxx, wxy, wyy : float
+        Variances over rows and cols, and covariance, of what one part of a ray stands for, in texels squared.
+    room : float
+        Variance that a probe may have at most.
+    top : int
+        Coarsest level.
     """
-    middle = (vxx + vyy) / 2
-    spread = np.sqrt((vxx - vyy) ** 2 / 4 + vxy * vxy)
+    middle = (wxx + wyy) / 2
+    spread = np.sqrt((wxx - wyy) ** 2 / 4 + wxy * wxy)
     major = middle + spread
     minor = max(middle - spread, 0.0)
-    most = ANISOTROPY * ANISOTROPY - 1.0
-    # n probes a step d apart add d^2 (n^2 - 1) / 12; d is at most a texel of the level
-    least = (12 * major - most) / (12 + 4 * most)
-    minor = max(minor, least)
-    extra = major - minor
-    count = np.sqrt(1 + 12 * max(extra, 0.0) / (1 + 4 * minor))
-    if count < 1.25:
-        minor = min(middle, major)
-        count = 1.0
-    else:
-        count = min(np.ceil(count - 1e-9), float(ANISOTROPY))
-    level = np.log2(1 + 4 * minor) / 2
+    count = np.ceil(np.sqrt(major / max(minor, _TEXEL)) - 0.3)
+    count = min(max(count, 1.0), float(ANISOTROPY))
+    wanted = _WIDER * max(minor, major / (ANISOTROPY * ANISOTROPY))
+    if count == 1.0:
+        wanted = _WIDER * middle
+    wanted = min(wanted, room)
+    level = np.log2(1 + wanted / _ADDED) / 2
     below = int(level)
-    share = 0.0
+    share = min(max((level - below - _RAMP0) / _RAMP1, 0.0), 1.0)
+    power = 4.0**below
+    if share > 0.0:
+        share = min(share, max((room / _ADDED - (power - 1)) / (3 * power), 0.0))
+    if share < 0.05:
+        share = 0.0
+    elif share > 0.95:
+        share = 0.0
+        below += 1
+        power *= 4
     if below >= top:
         below = top
+        share = 0.0
         count = 1.0
-    else:
-        power = 4.0**below
-        share = (minor - (power - 1) / 4) / (0.75 * power)
-        if share < 0.06:
-            share = 0.0
-        elif share > 0.94:
-            share = 0.0
-            below += 1
     out[0] = below
     out[1] = share
     out[2] = count
     out[3] = 0.0
     out[4] = 0.0
+    out[5] = _ADDED * (power - 1 + 3 * power * share)
     if count > 1.0:
-        step = np.sqrt(12 * extra / (count * count - 1))
+        step = np.sqrt(12 * major) / count
         # the eigenvector of the larger eigenvalue, from the row of the matrix that is farther from 0
-        x, y = vxy, major - vxx
-        if vxx >= vyy:
-            x, y = major - vyy, vxy
+        x, y = wxy, major - wxx
+        if wxx >= wyy:
+            x, y = major - wyy, wxy
         length = np.sqrt(x * x + y * y)
         if length > 0.0:
             out[3] = step * x / length
@@ -158,70 +176,156 @@ def choose_probes(vxx, vxy, vyy, top, out):
 
 
 @leaf
+def _root(matrix, out):
+    """Fill `out` (3,) with the square root of a symmetric matrix ``(xx, xy, yy)``; what is below 0 in it counts as 0."""
+    middle = (matrix[0] + matrix[2]) / 2
+    spread = np.sqrt((matrix[0] - matrix[2]) ** 2 / 4 + matrix[1] * matrix[1])
+    high = np.sqrt(max(middle + spread, 0.0))
+    low = np.sqrt(max(middle - spread, 0.0))
+    # root = a I + b M on both eigenvalues
+    b = (high - low) / (2 * spread) if spread > 0.0 else 0.0
+    a = high - b * (middle + spread)
+    out[0] = a + b * matrix[0]
+    out[1] = b * matrix[1]
+    out[2] = a + b * matrix[2]
+
+
+@leaf
+def _congruent(a, m, out):
+    """Fill `out` (3,) with A M A of symmetric matrices."""
+    p = a[0] * m[0] + a[1] * m[1]
+    q = a[0] * m[1] + a[1] * m[2]
+    r = a[1] * m[0] + a[2] * m[1]
+    s = a[1] * m[1] + a[2] * m[2]
+    out[0] = p * a[0] + q * a[1]
+    out[1] = p * a[1] + q * a[2]
+    out[2] = r * a[1] + s * a[2]
+
+
+@leaf
+def transport(have, want, out, scratch):
+    """Fill `out` (3,) with the symmetric T for which T have T = want, covariances ``(xx, xy, yy)``, the nearest to none.
+
+    The optimal transport of one Gaussian to another. `scratch` is (3, 3).
+    """
+    root, inner, middle = scratch[0], scratch[1], scratch[2]
+    _root(have, root)
+    _congruent(root, want, inner)
+    _root(inner, middle)
+    determinant = root[0] * root[2] - root[1] * root[1]
+    if determinant <= 1e-12 * (root[0] + root[2]) ** 2:
+        out[0], out[1], out[2] = 1.0, 0.0, 1.0
+        return
+    inner[0] = root[2] / determinant
+    inner[1] = -root[1] / determinant
+    inner[2] = root[0] / determinant
+    _congruent(inner, middle, out)
+
+
+@leaf
 def _fill_footprints(
-    target, corner, at_x, at_y, texels_per_unit, shift, variance, top, chosen, row, col, level, share,
-    count, steps,
+    target, corner, at_x, at_y, texels_per_unit, offset, stratum, means_x, means_y, film, top, scratch, row,
+    col, first, part_row, part_col, level, share, count, steps,
 ):  # fmt: skip
-    """Fill level, share, count and steps of look-ups, and shift `row` and `col`; returns whether any is more than a point."""
+    """List the parts of look-ups' footprints: those of look-up q from ``first[q]``; returns whether any is more than a point.
+
+    `film` has the variance of the filter, and of the means of the parts across and down. The arrays from `part_row` on have room
+    for all parts; `scratch` is (8, 6).
+    """
+    chosen, have, want, move = scratch[0], scratch[1], scratch[2], scratch[3]
     any_ = False
+    n = 0
     for q in range(len(target)):
+        first[q] = n
         h = target[q]
         # row runs against t
         rx = -texels_per_unit * at_x[q, 1]
         ry = -texels_per_unit * at_y[q, 1]
         cx = texels_per_unit * at_x[q, 0]
         cy = texels_per_unit * at_y[q, 0]
-        vxx = rx * rx * variance[h, 0] + ry * ry * variance[h, 1]
-        vxy = rx * cx * variance[h, 0] + ry * cy * variance[h, 1]
-        vyy = cx * cx * variance[h, 0] + cy * cy * variance[h, 1]
-        major = (vxx + vyy) / 2 + np.sqrt((vxx - vyy) ** 2 / 4 + vxy * vxy)
-        whole = min(max(major / _LEAST - 1, 0.0), 1.0)
-        level[q] = 0
-        share[q] = 0
-        count[q] = 1
-        steps[q, 0] = 0
-        steps[q, 1] = 0
-        if not whole > 0.0:
-            continue
-        any_ = True
-        choose_probes(whole * vxx, whole * vxy, whole * vyy, top, chosen)
-        level[q] = int(chosen[0])
-        share[q] = chosen[1]
-        count[q] = int(chosen[2])
-        steps[q, 0] = chosen[3]
-        steps[q, 1] = chosen[4]
-        if corner[q] < 0:
-            row[q] += whole * (rx * shift[h, 0] + ry * shift[h, 1])
-            col[q] += whole * (cx * shift[h, 0] + cy * shift[h, 1])
+        want[0] = film[0] * (rx * rx + ry * ry)
+        want[1] = film[0] * (rx * cx + ry * cy)
+        want[2] = film[0] * (cx * cx + cy * cy)
+        middle = (want[0] + want[2]) / 2
+        spread = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
+        whole = min(max((middle + spread) / _LEAST - 1, 0.0), 1.0)
+        parts_x = 1
+        parts_y = 1
+        if whole > 0.0:
+            any_ = True
+            have[0] = film[1] * rx * rx + film[2] * ry * ry
+            have[1] = film[1] * rx * cx + film[2] * ry * cy
+            have[2] = film[1] * cx * cx + film[2] * cy * cy
+            choose_probes(
+                want[0] - have[0], want[1] - have[1], want[2] - have[2], _ROOM * (middle - spread), top, chosen
+            )
+            if corner[q] < 0:
+                parts_x = means_x.shape[1]
+                parts_y = means_y.shape[1]
+                along = 1 - 1 / (chosen[2] * chosen[2])
+                along *= chosen[2] * chosen[2] / 12  # of squared steps
+                want[0] -= chosen[5] + along * chosen[3] * chosen[3]
+                want[1] -= along * chosen[3] * chosen[4]
+                want[2] -= chosen[5] + along * chosen[4] * chosen[4]
+                transport(have, want, move, scratch[4:7, :3])
+        for a in range(parts_x):
+            for b in range(parts_y):
+                part_row[n] = row[q]
+                part_col[n] = col[q]
+                level[n] = 0
+                share[n] = 0
+                count[n] = 1
+                steps[n, 0] = 0
+                steps[n, 1] = 0
+                if whole > 0.0:
+                    level[n] = int(chosen[0])
+                    share[n] = chosen[1]
+                    count[n] = int(chosen[2])
+                    steps[n, 0] = chosen[3]
+                    steps[n, 1] = chosen[4]
+                    if corner[q] < 0:
+                        x = means_x[stratum[h, 0], a]
+                        y = means_y[stratum[h, 1], b]
+                        u = rx * x + ry * y
+                        v = cx * x + cy * y
+                        x = move[0] * u + move[1] * v - rx * offset[h, 0] - ry * offset[h, 1]
+                        y = move[1] * u + move[2] * v - cx * offset[h, 0] - cy * offset[h, 1]
+                        part_row[n] += whole * x
+                        part_col[n] += whole * y
+                n += 1
+    first[len(target)] = n
     return any_
 
 
 @leaf
-def _count_probes(chosen, count, share, ends):
+def _count_probes(chosen, first, count, share, ends):
     """Fill the running number of probes `ends` (n,) of look-ups."""
     total = 0
     for q in range(len(chosen)):
-        i = chosen[q]
-        total += count[i] * (2 if share[i] > 0 else 1)
+        for i in range(first[chosen[q]], first[chosen[q] + 1]):
+            total += count[i] * (2 if share[i] > 0 else 1)
         ends[q] = total
 
 
 @leaf
-def _list_probes(chosen, row, col, level, share, count, steps, owner, at_row, at_col, at_level, weight):
+def _list_probes(
+    chosen, first, row, col, level, share, count, steps, owner, at_row, at_col, at_level, weight
+):  # fmt: skip
     """List the probes of look-ups: whose they are (numbered along `chosen`), coordinates of level 0, level, and weight."""
     n = 0
     for q in range(len(chosen)):
-        i = chosen[q]
-        for above in range(2 if share[i] > 0 else 1):
-            part = share[i] if above else 1.0 - share[i]
-            for k in range(count[i]):
-                by = k - (count[i] - 1) / 2
-                owner[n] = q
-                at_row[n] = row[i] + by * steps[i, 0]
-                at_col[n] = col[i] + by * steps[i, 1]
-                at_level[n] = level[i] + above
-                weight[n] = part / count[i]
-                n += 1
+        parts = first[chosen[q] + 1] - first[chosen[q]]
+        for i in range(first[chosen[q]], first[chosen[q] + 1]):
+            for above in range(2 if share[i] > 0 else 1):
+                some = (share[i] if above else 1.0 - share[i]) / (count[i] * parts)
+                for k in range(count[i]):
+                    by = k - (count[i] - 1) / 2
+                    owner[n] = q
+                    at_row[n] = row[i] + by * steps[i, 0]
+                    at_col[n] = col[i] + by * steps[i, 1]
+                    at_level[n] = level[i] + above
+                    weight[n] = some
+                    n += 1
 
 
 @leaf
@@ -242,26 +346,35 @@ class Footprints:
     at_x, at_y : (n, 3) float32
         The steps of `film_steps` in the look-ups' frames.
     texels_per_unit : float
-    shift : (points, 2) float64
+    offset, stratum : (points, 2)
         See `film_offsets`.
-    variance : (points, 2) float64
-        Of the strata, across and down the film.
+    means : tuple
+        Of the parts of strata across and down; see `strata_means`.
+    variance : float
+        See `filter_variance`.
 
     Attributes
     ----------
+    target : (n,) int64
+        The look-ups' points.
     points : bool
         Whether no look-up is more than a point: then nothing is filtered.
     """
 
-    def __init__(self, pyramid, row, col, target, corner, at_x, at_y, texels_per_unit, shift, variance):
+    def __init__(
+        self, pyramid, row, col, target, corner, at_x, at_y, texels_per_unit, offset, stratum, means, variance
+    ):  # fmt: skip
         self.pyramid, self.target = pyramid, target
-        n = len(row)
-        self.row, self.col = row.copy(), col.copy()
+        n = len(row) * means[0].shape[1] * means[1].shape[1]
+        self.first = np.empty(len(row) + 1, np.int64)
+        self.row, self.col, self.share = (np.empty(n, np.float32) for _ in range(3))
         self.level, self.count = np.empty(n, np.int16), np.empty(n, np.int16)
-        self.share, self.steps = np.empty(n, np.float32), np.empty((n, 2), np.float32)
+        self.steps = np.empty((n, 2), np.float32)
+        film = np.array([variance, means[0].var(), means[1].var()])
         self.points = not _fill_footprints(
-            target, corner, at_x, at_y, float(texels_per_unit), shift, variance, pyramid.top, np.empty(5),
-            self.row, self.col, self.level, self.share, self.count, self.steps,
+            target, corner, at_x, at_y, float(texels_per_unit), offset, stratum, *means, film, pyramid.top,
+            np.empty((8, 6)), row, col, self.first, self.row, self.col, self.level, self.share, self.count,
+            self.steps,
         )  # fmt: skip
 
     def average(self, chosen, evaluate, out):
@@ -278,7 +391,7 @@ class Footprints:
             Filled in place.
         """
         ends = np.empty(len(chosen), np.int64)
-        _count_probes(chosen, self.count, self.share, ends)
+        _count_probes(chosen, self.first, self.count, self.share, ends)
         out[:] = 0
         flat = out.reshape(len(out), -1)
         start = 0
@@ -289,8 +402,8 @@ class Footprints:
             owner, level = np.empty(n, np.int64), np.empty(n, np.int16)
             row, col, weight = (np.empty(n, np.float32) for _ in range(3))
             _list_probes(
-                chosen[start:stop], self.row, self.col, self.level, self.share, self.count, self.steps,
-                owner, row, col, level, weight,
+                chosen[start:stop], self.first, self.row, self.col, self.level, self.share, self.count,
+                self.steps, owner, row, col, level, weight,
             )  # fmt: skip
             owner += start
             for number in np.unique(level):
@@ -331,8 +444,8 @@ class Footprints:
 
         shader = self.pyramid.level(0)
         whole = shader.slices(self.row[:0], self.col[:0], w_o[:0])
-        whole.values = np.empty((len(self.row), *whole.values.shape[1:]), np.float32)
-        self.average(np.arange(len(self.row)), evaluate, whole.values)
+        whole.values = np.empty((len(self.target), *whole.values.shape[1:]), np.float32)
+        self.average(np.arange(len(self.target)), evaluate, whole.values)
         return whole
 
     def shade_sky(self, sky, frames, w_o, out, visibility):
@@ -345,4 +458,4 @@ class Footprints:
             level.shade(row, col, frames[which], w_o[which], values, visibility[which])
             return values
 
-        self.average(np.arange(len(self.row)), evaluate, out)
+        self.average(np.arange(len(self.target)), evaluate, out)

@@ -65,16 +65,15 @@ class Halving:
         self.shape = shape
         self.halved = halved_shape(shape)
         self.weight = np.ones(shape) if weight is None else weight
-        total = np.empty((1, math.prod(self.halved), 1))
-        one = np.ones((1, math.prod(shape), 1), np.float32)
-        _halve(one, *self._sizes(), self.weight, total, np.zeros_like(total, np.float32))
-        self.weight_above = total.reshape(self.halved)
+        self.taps = tuple(
+            _taps(n, m, toroidal) for n, m in zip(self.shape, self.halved, strict=True)
+        )
+        (row, by_row), (col, by_col) = self.taps
+        above = np.einsum("ia,iajb,jb->ij", by_row, self.weight[row][:, :, col], by_col)
+        self.weight_above = above
         self.nearest = None
-        if not self.weight_above.all():
-            self.nearest = _nearest(self.weight_above > 0, toroidal)
-
-    def _sizes(self):
-        return (*self.shape, *self.halved)
+        if not above.all():
+            self.nearest = _nearest(above > 0, toroidal)
 
     def __call__(self, values):
         """Average (rows * cols, ...) into float32 of as many texels as the next level has."""
@@ -83,9 +82,12 @@ class Halving:
     def pictures(self, values):
         """Average (n, rows * cols, ...) into float32 (n, texels of the next level, ...)."""
         n, texels = values.shape[:2]
-        out = np.empty((n, math.prod(self.halved), math.prod(values.shape[2:])), np.float32)
-        total = np.empty((1, out.shape[1], 1))
-        _halve(values.reshape(n, texels, -1), *self._sizes(), self.weight, total, out)
+        out = np.zeros((n, math.prod(self.halved), math.prod(values.shape[2:])), np.float32)
+        (row, by_row), (col, by_col) = self.taps
+        _halve(
+            values.reshape(n, texels, -1), self.shape[1], row, by_row, col, by_col, self.weight,
+            self.weight_above, out,
+        )  # fmt: skip
         if self.nearest is not None:
             out = out[:, self.nearest]
         return out.reshape(n, -1, *values.shape[2:])
@@ -99,32 +101,40 @@ class Halving:
         return other
 
 
+def _taps(n, m, toroidal):
+    """Which of n texels make up each of m, about half as many: index (m, 5) int64 and weight (m, 5) float64.
+
+    The means over what each covers of the n texels, once these are smoothed by (1, 2, 1) / 4: of an even n (1, 3, 3, 1) / 8.
+    """
+    index, weight = np.zeros((m, 5), np.int64), np.zeros((m, 5))
+    for k in range(m):
+        left, right = k * n / m, (k + 1) * n / m
+        first = int(left + 1e-9)
+        covered = [
+            max(min(right, i + 1) - max(left, i), 0) / (right - left) for i in range(first, first + 3)
+        ]
+        weight[k] = np.convolve(covered, [0.25, 0.5, 0.25])
+        index[k] = np.arange(first - 1, first + 4)
+    if toroidal:
+        return index % n, weight
+    return np.clip(np.where(index < 0, -1 - index, np.where(index >= n, 2 * n - 1 - index, index)), 0, n - 1), weight
+
+
 @leaf
-def _halve(values, rows, cols, half_rows, half_cols, weight, total, out):
-    """Fill `out` (n, texels, k) with weighted means, 0 where nothing has weight, and `total` (1, texels, 1) with the weights."""
-    for i in range(half_rows):
-        # from edge to edge; a whole texel is one unit
-        top = i * rows / half_rows
-        bottom = (i + 1) * rows / half_rows
-        for j in range(half_cols):
-            left = j * cols / half_cols
-            right = (j + 1) * cols / half_cols
-            at = i * half_cols + j
-            whole = 0.0
-            for y in range(int(top), min(int(np.ceil(bottom - 1e-9)), rows)):
-                high = min(bottom, y + 1.0) - max(top, float(y))
-                for x in range(int(left), min(int(np.ceil(right - 1e-9)), cols)):
-                    wide = min(right, x + 1.0) - max(left, float(x))
-                    whole += high * wide * weight[y, x]
-            total[0, at, 0] = whole
-            out[:, at] = np.float32(0)
-            if whole <= 0.0:
+def _halve(values, cols, row, by_row, col, by_col, weight, above, out):
+    """Add weighted means of `values` (n, texels, k) to `out` (n, coarser texels, k); nothing where nothing has weight."""
+    for i in range(len(row)):
+        for j in range(len(col)):
+            at = i * len(col) + j
+            if above[i, j] <= 0.0:
                 continue
-            for y in range(int(top), min(int(np.ceil(bottom - 1e-9)), rows)):
-                high = min(bottom, y + 1.0) - max(top, float(y))
-                for x in range(int(left), min(int(np.ceil(right - 1e-9)), cols)):
-                    wide = min(right, x + 1.0) - max(left, float(x))
-                    share = np.float32(high * wide * weight[y, x] / whole)
+            for a in range(row.shape[1]):
+                for b in range(col.shape[1]):
+                    y = row[i, a]
+                    x = col[j, b]
+                    share = np.float32(by_row[i, a] * by_col[j, b] * weight[y, x] / above[i, j])
+                    if share == 0.0:
+                        continue
                     for p in range(values.shape[0]):
                         for k in range(values.shape[2]):
                             out[p, at, k] += share * np.float32(values[p, y * cols + x, k])

@@ -6,7 +6,7 @@ from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.clearance import clearance
-from btfpipe.rendering.footprint import Footprints, film_offsets, film_steps, strata_moments
+from btfpipe.rendering.footprint import Footprints, film_offsets, film_steps, filter_variance, strata_means
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
@@ -69,7 +69,7 @@ class Renderer:
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
         rows, cols = strata(scene.film.samples)
-        self.moments = strata_moments(self.table, cols), strata_moments(self.table, rows)
+        self.means = strata_means(self.table, cols), strata_means(self.table, rows)
         # single precision positions are this far off at the scene's size
         self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
         self.tree = EmbreeScene(robust=True)
@@ -252,13 +252,8 @@ class Renderer:
             *over,
         )  # fmt: skip
         rows, cols = strata(film.samples)
-        shift, variance = np.empty((n, 2)), np.empty((n, 2))
-        (mean_x, variance_x), (mean_y, variance_y) = self.moments
-        film_offsets(
-            points.pixels, rows, cols, self.table, self.seed, mean_x, mean_y, shift
-        )
-        stratum = points.pixels % film.samples
-        variance[:, 0], variance[:, 1] = variance_x[stratum % cols], variance_y[stratum // cols]
+        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
+        film_offsets(points.pixels, rows, cols, self.table, self.seed, offset, stratum)
         for number in filtered:
             thing = self.scene.objects[number]
             mine = np.flatnonzero(points.thing == number)
@@ -266,7 +261,8 @@ class Renderer:
             at_y = self._look_up(thing, mine, points, over[1])[2]
             made = Footprints(
                 thing.dressing.pyramid, row, col, target, corner, at_x, at_y,
-                thing.dressing.texels_per_unit, shift, variance,
+                thing.dressing.texels_per_unit, offset, stratum, self.means,
+                filter_variance(self.table),
             )  # fmt: skip
             if not made.points:
                 found[number] = made
