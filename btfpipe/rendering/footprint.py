@@ -23,26 +23,44 @@ from btfpipe.parallel import blocks
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
 PROBES = 1 << 14  # evaluated at a time
 _LEAST = 0.04  # variance of a pixel, in texels squared, up to which it is a point; whole from twice that on
-_LEAST_PARTS = 2  # of a filter along each axis
+_MOST_PARTS = 3  # of a stratum along each axis
+_WIDEST = 0.4  # standard deviation of a part over that of the filter
 _ADDED = 5 / 12  # variance of level l: so often 4^l - 1
 _TEXEL = 1 / 12  # variance that a texel of level 0 stands for
-_WIDER = 1.0  # variance of a probe to that of what it stands for, so that neighbouring ones leave no gap
+_WIDER = (
+    3.0  # variance of a probe to that of what it stands for, so that neighbouring ones leave no gap
+)
 _ROOM = 0.5  # at most so much of a pixel's variance is a probe's own
-_RAMP0, _RAMP1 = 0.2, 0.4
+_RAMP = (
+    0.2,
+    0.4,
+)  # where between two levels the upper one comes in, and how fast: it is preferred, as it costs no less
 _STEPS = 256  # of a stratum's integrals
 _GRAZING = 1e-3  # cosine at which a tangent plane is seen from the side
 
 
-def strata_means(table, count):
-    """Means (count, parts) float64 of the parts of a filter's strata, in pixels; see `camera.filter_table`.
+def strata_parts(table, count):
+    """Means and weights (2, count, parts) float64 of the parts of a filter's strata, in pixels; see `camera.filter_table`.
 
-    A ray stands for its stratum, or for as many equal parts of it as make at least `_LEAST_PARTS` along the axis.
+    A ray stands for its stratum. Strata that are wide, as the outer ones of a filter with tails are, are divided at their mean, again
+    and again, so that all parts are about as wide; a part that a stratum lacks has weight 0, the others of one stratum add up to 1.
     """
-    parts = -(-_LEAST_PARTS // count)
-    steps = max(_STEPS, 4 * len(table) // (count * parts))
-    at = (np.arange(count * parts * steps) + 0.5) / (count * parts * steps)
+    steps = max(_STEPS, 8 * len(table) // count)
+    at = (np.arange(count * steps) + 0.5) / (count * steps)
     offsets = np.interp(at * (len(table) - 1), np.arange(len(table)), table)
-    return offsets.reshape(count, parts, steps).mean(axis=2)
+    widest = _WIDEST * offsets.std()
+    out = np.zeros((2, count, _MOST_PARTS))
+    for stratum, values in enumerate(offsets.reshape(count, steps)):
+        parts = [values]
+        while len(parts) < _MOST_PARTS:
+            wide = max(range(len(parts)), key=lambda k: parts[k].std())
+            if parts[wide].std() <= widest:
+                break
+            part = parts[wide]
+            parts[wide : wide + 1] = [part[part < part.mean()], part[part >= part.mean()]]
+        out[0, stratum, : len(parts)] = [part.mean() for part in parts]
+        out[1, stratum, : len(parts)] = [len(part) / steps for part in parts]
+    return out
 
 
 def filter_variance(table):
@@ -143,7 +161,7 @@ def choose_probes(wxx, wxy, wyy, room, top, out):
     wanted = min(wanted, room)
     level = np.log2(1 + wanted / _ADDED) / 2
     below = int(level)
-    share = min(max((level - below - _RAMP0) / _RAMP1, 0.0), 1.0)
+    share = min(max((level - below - _RAMP[0]) / _RAMP[1], 0.0), 1.0)
     power = 4.0**below
     if share > 0.0:
         share = min(share, max((room / _ADDED - (power - 1)) / (3 * power), 0.0))
@@ -224,8 +242,8 @@ def transport(have, want, out, scratch):
 
 @leaf
 def _fill_footprints(
-    target, corner, at_x, at_y, texels_per_unit, offset, stratum, means_x, means_y, film, top, scratch, row,
-    col, first, part_row, part_col, level, share, count, steps,
+    target, corner, at_x, at_y, texels_per_unit, offset, stratum, parts_x, parts_y, film, top, scratch, row,
+    col, first, part_row, part_col, weight, level, share, count, steps,
 ):  # fmt: skip
     """List the parts of look-ups' footprints: those of look-up q from ``first[q]``; returns whether any is more than a point.
 
@@ -249,27 +267,35 @@ def _fill_footprints(
         middle = (want[0] + want[2]) / 2
         spread = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
         whole = min(max((middle + spread) / _LEAST - 1, 0.0), 1.0)
-        parts_x = 1
-        parts_y = 1
+        most = 1
         if whole > 0.0:
             any_ = True
             have[0] = film[1] * rx * rx + film[2] * ry * ry
             have[1] = film[1] * rx * cx + film[2] * ry * cy
             have[2] = film[1] * cx * cx + film[2] * cy * cy
             choose_probes(
-                want[0] - have[0], want[1] - have[1], want[2] - have[2], _ROOM * (middle - spread), top, chosen
+                want[0] - have[0],
+                want[1] - have[1],
+                want[2] - have[2],
+                _ROOM * (middle - spread),
+                top,
+                chosen,
             )
             if corner[q] < 0:
-                parts_x = means_x.shape[1]
-                parts_y = means_y.shape[1]
+                most = parts_x.shape[2]
                 along = 1 - 1 / (chosen[2] * chosen[2])
                 along *= chosen[2] * chosen[2] / 12  # of squared steps
                 want[0] -= chosen[5] + along * chosen[3] * chosen[3]
                 want[1] -= along * chosen[3] * chosen[4]
                 want[2] -= chosen[5] + along * chosen[4] * chosen[4]
                 transport(have, want, move, scratch[4:7, :3])
-        for a in range(parts_x):
-            for b in range(parts_y):
+        for a in range(most):
+            for b in range(most):
+                weight[n] = 1.0
+                if most > 1:
+                    weight[n] = parts_x[1, stratum[h, 0], a] * parts_y[1, stratum[h, 1], b]
+                    if weight[n] == 0.0:
+                        continue
                 part_row[n] = row[q]
                 part_col[n] = col[q]
                 level[n] = 0
@@ -284,8 +310,8 @@ def _fill_footprints(
                     steps[n, 0] = chosen[3]
                     steps[n, 1] = chosen[4]
                     if corner[q] < 0:
-                        x = means_x[stratum[h, 0], a]
-                        y = means_y[stratum[h, 1], b]
+                        x = parts_x[0, stratum[h, 0], a]
+                        y = parts_y[0, stratum[h, 1], b]
                         u = rx * x + ry * y
                         v = cx * x + cy * y
                         x = move[0] * u + move[1] * v - rx * offset[h, 0] - ry * offset[h, 1]
@@ -309,15 +335,14 @@ def _count_probes(chosen, first, count, share, ends):
 
 @leaf
 def _list_probes(
-    chosen, first, row, col, level, share, count, steps, owner, at_row, at_col, at_level, weight
+    chosen, first, row, col, part, level, share, count, steps, owner, at_row, at_col, at_level, weight
 ):  # fmt: skip
     """List the probes of look-ups: whose they are (numbered along `chosen`), coordinates of level 0, level, and weight."""
     n = 0
     for q in range(len(chosen)):
-        parts = first[chosen[q] + 1] - first[chosen[q]]
         for i in range(first[chosen[q]], first[chosen[q] + 1]):
             for above in range(2 if share[i] > 0 else 1):
-                some = (share[i] if above else 1.0 - share[i]) / (count[i] * parts)
+                some = part[i] * (share[i] if above else 1.0 - share[i]) / count[i]
                 for k in range(count[i]):
                     by = k - (count[i] - 1) / 2
                     owner[n] = q
@@ -348,8 +373,8 @@ class Footprints:
     texels_per_unit : float
     offset, stratum : (points, 2)
         See `film_offsets`.
-    means : tuple
-        Of the parts of strata across and down; see `strata_means`.
+    parts : tuple
+        Of strata across and down; see `strata_parts`.
     variance : float
         See `filter_variance`.
 
@@ -362,18 +387,21 @@ class Footprints:
     """
 
     def __init__(
-        self, pyramid, row, col, target, corner, at_x, at_y, texels_per_unit, offset, stratum, means, variance
+        self, pyramid, row, col, target, corner, at_x, at_y, texels_per_unit, offset, stratum, parts, variance
     ):  # fmt: skip
         self.pyramid, self.target = pyramid, target
-        n = len(row) * means[0].shape[1] * means[1].shape[1]
+        most = [int(np.count_nonzero(some[1], axis=1).max()) for some in parts]
+        n = len(row) * most[0] * most[1] + 1
         self.first = np.empty(len(row) + 1, np.int64)
-        self.row, self.col, self.share = (np.empty(n, np.float32) for _ in range(3))
+        self.row, self.col, self.weight, self.share = (np.empty(n, np.float32) for _ in range(4))
         self.level, self.count = np.empty(n, np.int16), np.empty(n, np.int16)
         self.steps = np.empty((n, 2), np.float32)
-        film = np.array([variance, means[0].var(), means[1].var()])
+        film = np.array(
+            [variance, *((some[0] ** 2 * some[1]).sum() / len(some[0]) for some in parts)]
+        )
         self.points = not _fill_footprints(
-            target, corner, at_x, at_y, float(texels_per_unit), offset, stratum, *means, film, pyramid.top,
-            np.empty((8, 6)), row, col, self.first, self.row, self.col, self.level, self.share, self.count,
+            target, corner, at_x, at_y, float(texels_per_unit), offset, stratum, *parts, film, pyramid.top,
+            np.empty((8, 6)), row, col, self.first, self.row, self.col, self.weight, self.level, self.share, self.count,
             self.steps,
         )  # fmt: skip
 
@@ -402,7 +430,7 @@ class Footprints:
             owner, level = np.empty(n, np.int64), np.empty(n, np.int16)
             row, col, weight = (np.empty(n, np.float32) for _ in range(3))
             _list_probes(
-                chosen[start:stop], self.first, self.row, self.col, self.level, self.share, self.count,
+                chosen[start:stop], self.first, self.row, self.col, self.weight, self.level, self.share, self.count,
                 self.steps, owner, row, col, level, weight,
             )  # fmt: skip
             owner += start

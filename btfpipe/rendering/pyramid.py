@@ -111,13 +111,16 @@ def _taps(n, m, toroidal):
         left, right = k * n / m, (k + 1) * n / m
         first = int(left + 1e-9)
         covered = [
-            max(min(right, i + 1) - max(left, i), 0) / (right - left) for i in range(first, first + 3)
+            max(min(right, i + 1) - max(left, i), 0) / (right - left)
+            for i in range(first, first + 3)
         ]
         weight[k] = np.convolve(covered, [0.25, 0.5, 0.25])
         index[k] = np.arange(first - 1, first + 4)
     if toroidal:
         return index % n, weight
-    return np.clip(np.where(index < 0, -1 - index, np.where(index >= n, 2 * n - 1 - index, index)), 0, n - 1), weight
+    return np.clip(
+        np.where(index < 0, -1 - index, np.where(index >= n, 2 * n - 1 - index, index)), 0, n - 1
+    ), weight
 
 
 @leaf
@@ -150,9 +153,7 @@ def _nearest(valid, toroidal):
     invalid = np.pad(~valid, [(n, n) for n in pad], "wrap")
     index = distance_transform_edt(invalid, return_distances=False, return_indices=True)
     inside = tuple(slice(n, n + size) for n, size in zip(pad, valid.shape, strict=True))
-    row, col = (
-        (i[inside] - n) % size for i, n, size in zip(index, pad, valid.shape, strict=True)
-    )
+    row, col = ((i[inside] - n) % size for i, n, size in zip(index, pad, valid.shape, strict=True))
     return (row * valid.shape[1] + col).ravel()
 
 

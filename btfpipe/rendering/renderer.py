@@ -6,7 +6,13 @@ from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.clearance import clearance
-from btfpipe.rendering.footprint import Footprints, film_offsets, film_steps, filter_variance, strata_means
+from btfpipe.rendering.footprint import (
+    Footprints,
+    film_offsets,
+    film_steps,
+    filter_variance,
+    strata_parts,
+)
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
@@ -69,7 +75,7 @@ class Renderer:
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
         rows, cols = strata(scene.film.samples)
-        self.means = strata_means(self.table, cols), strata_means(self.table, rows)
+        self.parts = strata_parts(self.table, cols), strata_parts(self.table, rows)
         # single precision positions are this far off at the scene's size
         self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
         self.tree = EmbreeScene(robust=True)
@@ -261,7 +267,7 @@ class Renderer:
             at_y = self._look_up(thing, mine, points, over[1])[2]
             made = Footprints(
                 thing.dressing.pyramid, row, col, target, corner, at_x, at_y,
-                thing.dressing.texels_per_unit, offset, stratum, self.means,
+                thing.dressing.texels_per_unit, offset, stratum, self.parts,
                 filter_variance(self.table),
             )  # fmt: skip
             if not made.points:

@@ -71,7 +71,7 @@ class RawShader(PairShader):
             values = self.codes[:, part]
             values = values * self.table[0] if single else self.table[values]
             if len(self.gain):
-                values = values * np.tile(self.gain, (values.shape[1] // 3, ))
+                values = values * np.tile(self.gain, (values.shape[1] // 3,))
             codes[:, part] = halving(values)
         table = np.ones(1, np.float32)
         if not single:
