@@ -1,28 +1,32 @@
 """What a ray covers of the sample, and the texels of a `Pyramid` that stand for it.
 
-A pixel's rays follow its reconstruction filter, each in a stratum of it. The mean and the variances of a stratum, taken to
-the surface's tangent plane by ray differentials (Igehy 1999) and to texels by the local frame, are what the texture is
-averaged over for that ray: the averages of all strata add up to the filter's own, so that nothing is averaged twice.
+A pixel's rays follow its reconstruction filter, each in a stratum of it. Where several texels share a pixel a ray no longer shows the
+point that it hits: its look-up moves to the mean of its stratum, by ray differentials (Igehy 1999) on the surface's tangent
+plane and by the local frame, and to a level whose texels leave no gap between neighbouring strata. What such a probe
+is wider than its stratum the means are drawn together, so that all rays of a pixel add up to the variance of its filter: the
+picture is neither noisier nor more blurred than with any number of rays.
 
-An elliptical footprint is read by several probes along its major axis, each as wide as the minor axis (McCormack et al. 1999,
-*Feline*), between two levels whose variances enclose the minor axis's. All variances are in texels squared: level l adds
-(4^l - 1) / 4 to that of level 0, a third of it by the means of texels and two thirds by reading between them.
+An elliptical footprint is read by several probes along its major axis (McCormack et al. 1999, *Feline*). All variances are in
+texels squared: a probe of level l has 5 / 12 (4^l - 1) more than one of level 0, three fifths by the low-pass of
+the levels and two by reading between their texels.
 
-That lights and views differ within a footprint is neglected: they turn by about the angle of a pixel.
+That lights and views differ within a footprint is neglected: they turn by about the angle of a pixel. Inside triangles whose
+vertices are blended there is no coordinate to move; each vertex is read at its own, as widely.
 """
 
 import copy
+import math
 
 import numpy as np
 from numba import njit
 
 from btfpipe.compiled import leaf
 from btfpipe.hashing import uniform
-from btfpipe.parallel import blocks
 
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
 PROBES = 1 << 14  # evaluated at a time
-_LEAST = 0.04  # variance of a pixel, in texels squared, up to which it is a point; whole from twice that on
+_LEAST = 0.1  # variance of a pixel, in texels squared, up to which it is a point (0.63 texels); whole from twice that on
+_SPLIT = 0.12  # variance that rays stand for, both axes, from which on strata are divided
 _MOST_PARTS = 3  # of a stratum along each axis
 _WIDEST = 0.4  # standard deviation of a part over that of the filter
 _ADDED = 5 / 12  # variance of level l: so often 4^l - 1
@@ -241,14 +245,22 @@ def transport(have, want, out, scratch):
 
 
 @leaf
+def _covariance(rx, ry, cx, cy, across, down, out):
+    """Fill `out` (3,) with the covariance over (row, col) of variances across and down the film."""
+    out[0] = across * rx * rx + down * ry * ry
+    out[1] = across * rx * cx + down * ry * cy
+    out[2] = across * cx * cx + down * cy * cy
+
+
+@leaf
 def _fill_footprints(
     target, corner, at_x, at_y, texels_per_unit, offset, stratum, parts_x, parts_y, film, top, scratch, row,
     col, first, part_row, part_col, weight, level, share, count, steps,
 ):  # fmt: skip
     """List the parts of look-ups' footprints: those of look-up q from ``first[q]``; returns whether any is more than a point.
 
-    `film` has the variance of the filter, and of the means of the parts across and down. The arrays from `part_row` on have room
-    for all parts; `scratch` is (8, 6).
+    `film` has the variance of the filter, those of the means of its strata and of the means of their parts, each across and down,
+    and the means of the strata themselves. The arrays from `part_row` on have room for all parts; `scratch` is (8, 6).
     """
     chosen, have, want, move = scratch[0], scratch[1], scratch[2], scratch[3]
     any_ = False
@@ -261,18 +273,18 @@ def _fill_footprints(
         ry = -texels_per_unit * at_y[q, 1]
         cx = texels_per_unit * at_x[q, 0]
         cy = texels_per_unit * at_y[q, 0]
-        want[0] = film[0] * (rx * rx + ry * ry)
-        want[1] = film[0] * (rx * cx + ry * cy)
-        want[2] = film[0] * (cx * cx + cy * cy)
+        _covariance(rx, ry, cx, cy, film[0], film[0], want)
         middle = (want[0] + want[2]) / 2
         spread = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
         whole = min(max((middle + spread) / _LEAST - 1, 0.0), 1.0)
         most = 1
         if whole > 0.0:
             any_ = True
-            have[0] = film[1] * rx * rx + film[2] * ry * ry
-            have[1] = film[1] * rx * cx + film[2] * ry * cy
-            have[2] = film[1] * cx * cx + film[2] * cy * cy
+            _covariance(rx, ry, cx, cy, film[1], film[2], have)
+            wide = (want[0] - have[0]) + (want[2] - have[2]) > _SPLIT
+            if wide and corner[q] < 0:
+                most = parts_x.shape[2]
+                _covariance(rx, ry, cx, cy, film[3], film[4], have)
             choose_probes(
                 want[0] - have[0],
                 want[1] - have[1],
@@ -282,7 +294,6 @@ def _fill_footprints(
                 chosen,
             )
             if corner[q] < 0:
-                most = parts_x.shape[2]
                 along = 1 - 1 / (chosen[2] * chosen[2])
                 along *= chosen[2] * chosen[2] / 12  # of squared steps
                 want[0] -= chosen[5] + along * chosen[3] * chosen[3]
@@ -312,6 +323,9 @@ def _fill_footprints(
                     if corner[q] < 0:
                         x = parts_x[0, stratum[h, 0], a]
                         y = parts_y[0, stratum[h, 1], b]
+                        if most == 1:
+                            x = film[5 + stratum[h, 0]]
+                            y = film[5 + parts_x.shape[1] + stratum[h, 1]]
                         u = rx * x + ry * y
                         v = cx * x + cy * y
                         x = move[0] * u + move[1] * v - rx * offset[h, 0] - ry * offset[h, 1]
@@ -390,15 +404,14 @@ class Footprints:
         self, pyramid, row, col, target, corner, at_x, at_y, texels_per_unit, offset, stratum, parts, variance
     ):  # fmt: skip
         self.pyramid, self.target = pyramid, target
-        most = [int(np.count_nonzero(some[1], axis=1).max()) for some in parts]
-        n = len(row) * most[0] * most[1] + 1
+        n = len(row) * math.prod(int((some[1] > 0).sum(axis=1).max()) for some in parts) + 1
         self.first = np.empty(len(row) + 1, np.int64)
         self.row, self.col, self.weight, self.share = (np.empty(n, np.float32) for _ in range(4))
         self.level, self.count = np.empty(n, np.int16), np.empty(n, np.int16)
         self.steps = np.empty((n, 2), np.float32)
-        film = np.array(
-            [variance, *((some[0] ** 2 * some[1]).sum() / len(some[0]) for some in parts)]
-        )
+        whole = [(some[0] * some[1]).sum(axis=1) for some in parts]
+        divided = [(some[0] ** 2 * some[1]).sum(axis=1).mean() for some in parts]
+        film = np.concatenate([[variance], [means.var() for means in whole], divided, *whole])
         self.points = not _fill_footprints(
             target, corner, at_x, at_y, float(texels_per_unit), offset, stratum, *parts, film, pyramid.top,
             np.empty((8, 6)), row, col, self.first, self.row, self.col, self.weight, self.level, self.share, self.count,
