@@ -19,8 +19,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from btfpipe.compiled import leaf
+from btfpipe.sample.shading import corners
 
 ERROR_BOUND = 0.04  # RMS of an SVD's error over the RMS of the averaged values; a picture averages most of it away
+_UNUSED = 0.01  # weight of a texel that a map does not use, over the mean weight
 FIRST_TERMS, MOST_TERMS = 64, 512  # of that SVD; doubled until it is within the bound
 
 
@@ -155,6 +157,39 @@ def _nearest(valid, toroidal):
     inside = tuple(slice(n, n + size) for n, size in zip(pad, valid.shape, strict=True))
     row, col = ((i[inside] - n) % size for i, n, size in zip(index, pad, valid.shape, strict=True))
     return (row * valid.shape[1] + col).ravel()
+
+
+def usage(thing):
+    """How much of a dressed object each texel of the sample covers (rows, cols) float64.
+
+    With these weights a look-up on any level has the mean of what the object shows, not of the whole sample: a map may leave
+    parts of it out, invalid texels always. Texels that the map does not use count a little, for footprints that reach them.
+    """
+    dress = thing.dressing
+    points = thing.vertices[thing.faces]
+    area = np.linalg.norm(
+        np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1
+    )
+    own = np.bincount(thing.faces.ravel(), np.repeat(area, 3), len(thing.vertices))
+    total = np.zeros(dress.model.shape)
+    texel, share = np.zeros(4, np.int64), np.zeros(4, np.float32)
+    for row, col, weight in zip(dress.row, dress.col, dress.weight, strict=True):
+        _splat(
+            row, col, own * weight, *dress.model.shape, bool(dress.model.toroidal), texel, share, total
+        )  # fmt: skip
+    total += _UNUSED * total.mean()
+    if dress.model.mask is not None:
+        total *= dress.model.mask
+    return total
+
+
+@leaf
+def _splat(row, col, weight, rows, cols, toroidal, texel, share, total):
+    """Add the weights of coordinates to the four texels around each."""
+    for q in range(len(row)):
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
+        for k in range(4):
+            total[texel[k] // cols, texel[k] % cols] += weight[q] * share[k]
 
 
 class Pyramid:

@@ -158,7 +158,7 @@ def load_scene(
                 thing = _thing(entry, once, read_mesh)
                 things.append(objects.transformed(thing, entry.get("transform")))
                 if film.texture_filter and thing.dressing is not None:
-                    thing.dressing.pyramid = _pyramid(pyramids, entry, thing.dressing, threads)
+                    thing.dressing.pyramid = _pyramid(pyramids, entry, thing, threads)
         for number, sky in skies.items():
             with naming_entry("lights", number):
                 _add_sky(things, *sky)
@@ -246,19 +246,20 @@ def _material(once, entry):
     return once(choose_material, appearance, entry.get("material"), entry["model"])
 
 
-def _pyramid(pyramids, entry, dressing, threads):
-    """Levels of detail of what an object wears; objects of one Model share them."""
-    from btfpipe.rendering.pyramid import Pyramid
+def _pyramid(pyramids, entry, thing, threads):
+    """Levels of detail of what an object wears; objects of one Model share them, those with a map of their own do not."""
+    from btfpipe.rendering.pyramid import Pyramid, usage
 
-    key = id(dressing.shader)
+    dressing = thing.dressing
+    key = (id(dressing.shader), entry.get("map"), entry.get("surface"), str(entry.get("plane")))
+    if "map" not in entry:
+        key = id(dressing.shader)
     if key not in pyramids:
+        weight = usage(thing) if "map" in entry else None
+        interpolation = entry.get("interpolation", "barycentric")
         pyramids[key] = Pyramid(
-            dressing.model,
-            dressing.shader,
-            entry.get("interpolation", "barycentric"),
-            name=entry["model"],
-            threads=threads,
-        )
+            dressing.model, dressing.shader, interpolation, weight=weight, name=entry["model"], threads=threads
+        )  # fmt: skip
     return pyramids[key]
 
 
