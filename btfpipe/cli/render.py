@@ -74,7 +74,7 @@ def render(
     from btfpipe.formats.meshes import read_mesh
     from btfpipe.rendering.renderer import LAYERS
     from btfpipe.rendering.renderer import render as render_scene
-    from btfpipe.rendering.scene import load_scene
+    from btfpipe.rendering.scene import load_scene, texture_filter_facts
 
     if Path(out).suffix.lower() != ".exr":
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
@@ -108,6 +108,8 @@ def render(
         )
     half = [not full and name[0] in short for name in LAYERS]
     write_picture(out, picture, names=list(LAYERS), half=half)
+    levels = texture_filter_facts(loaded)
+    warnings += levels.pop("warnings", [])
     warn(*warnings)
     return {
         "inputs": [scene, *loaded.files],
@@ -116,6 +118,7 @@ def render(
         "samples": loaded.film.samples,
         "load_seconds": round(load_seconds, 3),
         "render_seconds": round(render_seconds, 3),
+        "texture_filter": loaded.film.texture_filter and levels,
         "covered": float((picture[..., 3] > 0).mean()),
         "warnings": warnings,
     }

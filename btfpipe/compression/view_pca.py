@@ -105,7 +105,8 @@ class ViewPcaModel(Model):
         weights = reader.require("weights", (None,) * 3, "f", finite=False)
         kept = 4 * (means.size + textures.size + weights.size)
         # while values are checked, then a view in single precision
-        return ShadingNeeds(kept, max(textures.size, 2 * kept // max(len(means), 1)))
+        loading = max(textures.size, 2 * kept // max(len(means), 1))
+        return ShadingNeeds(kept, loading, levels=2 * (means.size + textures.size))
 
     def shader(self, interpolation="barycentric"):
         return ViewPcaShader(self, interpolation)

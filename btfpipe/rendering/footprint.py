@@ -27,6 +27,8 @@ ANISOTROPY = 16  # probes at most; a longer footprint is widened
 PROBES = 1 << 14  # evaluated at a time
 _LEAST = 0.1  # variance of a pixel, in texels squared, up to which it is a point (0.63 texels); whole from twice that on
 _SPLIT = 0.12  # variance that rays stand for, both axes, from which on strata are divided
+_TEXTURE_RATE = 3.3  # texture rays along an axis of the film for a texel a pixel
+MOST_TEXTURE_RAYS = 4  # of a ray along an axis
 _MOST_PARTS = 3  # of a stratum along each axis
 _WIDEST = 0.4  # standard deviation of a part over that of the filter
 _ADDED = 5 / 12  # variance of level l: so often 4^l - 1
@@ -141,13 +143,75 @@ def film_offsets(pixels, rows, cols, table, seed, offset, stratum):
 
 
 @leaf
-def choose_probes(wxx, wxy, wyy, room, top, out):
+def count_texture_rays(mine, over_x, over_y, texels_per_unit, rows, cols, across, down):
+    """Fill how many texture rays points of a mapped object need, `across` and `down` (m,) int64; returns their sum.
+
+    One more than half a texel apart would miss what the map shows between them, up to `MOST_TEXTURE_RAYS` along an axis.
+    """
+    total = 0
+    for q in range(len(mine)):
+        h = mine[q]
+        x = np.sqrt(over_x[h, 0] ** 2 + over_x[h, 1] ** 2 + over_x[h, 2] ** 2) * texels_per_unit
+        y = np.sqrt(over_y[h, 0] ** 2 + over_y[h, 1] ** 2 + over_y[h, 2] ** 2) * texels_per_unit
+        across[q] = int(min(max(np.ceil(_TEXTURE_RATE * x / cols), 1.0), MOST_TEXTURE_RAYS))
+        down[q] = int(min(max(np.ceil(_TEXTURE_RATE * y / rows), 1.0), MOST_TEXTURE_RAYS))
+        total += across[q] * down[q]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def texture_rays(
+    pixels, mine, across, down, rows, cols, film_width, film_height, table, position, axes, extent,
+    perspective, offset, parent, origins, directions,
+):  # fmt: skip
+    """Rays through the middles of equal parts of points' strata: fills parent (m,), origins and directions (m, 3).
+
+    A point with one part keeps its own ray, `offset` in its pixel.
+    """
+    samples = rows * cols
+    last = len(table) - 1
+    n = 0
+    for q in range(len(mine)):
+        h = mine[q]
+        pixel = pixels[h] // samples
+        s = pixels[h] % samples
+        for a in range(down[q]):
+            for b in range(across[q]):
+                dx = offset[h, 0]
+                dy = offset[h, 1]
+                if across[q] > 1 or down[q] > 1:
+                    u = (s % cols + (b + 0.5) / across[q]) / cols
+                    v = (s // cols + (a + 0.5) / down[q]) / rows
+                    i = min(int(u * last), last - 1)
+                    j = min(int(v * last), last - 1)
+                    dx = table[i] + (u * last - i) * (table[i + 1] - table[i])
+                    dy = table[j] + (v * last - j) * (table[j + 1] - table[j])
+                right = ((pixel % film_width + 0.5 + dx) / film_width * 2.0 - 1.0) * extent[0]
+                up = (1.0 - (pixel // film_width + 0.5 + dy) / film_height * 2.0) * extent[1]
+                length = np.sqrt(1.0 + right * right + up * up)
+                parent[n] = h
+                for k in range(3):
+                    if perspective:
+                        origins[n, k] = position[k]
+                        directions[n, k] = (
+                            axes[2, k] + right * axes[0, k] + up * axes[1, k]
+                        ) / length
+                    else:
+                        origins[n, k] = position[k] + right * axes[0, k] + up * axes[1, k]
+                        directions[n, k] = axes[2, k]
+                n += 1
+
+
+@leaf
+def choose_probes(wxx, wxy, wyy, wider, room, top, out):
     """Level, share of the level above, probes, and the step (row, col) between them: fill `out` (6,), variance of a probe last.
 
     Parameters
     ----------
     wxx, wxy, wyy : float
         Variances over rows and cols, and covariance, of what one part of a ray stands for, in texels squared.
+    wider : float
+        Variance of a probe to that of what it stands for.
     room : float
         Variance that a probe may have at most.
     top : int
@@ -159,9 +223,9 @@ def choose_probes(wxx, wxy, wyy, room, top, out):
     minor = max(middle - spread, 0.0)
     count = np.ceil(np.sqrt(major / max(minor, _TEXEL)) - 0.3)
     count = min(max(count, 1.0), float(ANISOTROPY))
-    wanted = _WIDER * max(minor, major / (ANISOTROPY * ANISOTROPY))
+    wanted = wider * max(minor, major / (ANISOTROPY * ANISOTROPY))
     if count == 1.0:
-        wanted = _WIDER * middle
+        wanted = wider * middle
     wanted = min(wanted, room)
     level = np.log2(1 + wanted / _ADDED) / 2
     below = int(level)
@@ -289,6 +353,7 @@ def _fill_footprints(
                 want[0] - have[0],
                 want[1] - have[1],
                 want[2] - have[2],
+                _WIDER if corner[q] < 0 else 1.0,
                 _ROOM * (middle - spread),
                 top,
                 chosen,

@@ -31,6 +31,8 @@ class Dressing:
         What the shader evaluates.
     texels_per_unit : float
         Texels per unit of length of the scene.
+    mapped : bool
+        Whether the coordinates are a map's, with borders between pieces of the sample.
     pyramid : Pyramid or None
         Levels of detail; None if look-ups are not filtered.
     skies : dict
@@ -48,6 +50,7 @@ class Dressing:
     toroidal: bool
     model: object = None
     texels_per_unit: float = 1.0
+    mapped: bool = False
     pyramid: object = None
     skies: dict = field(default_factory=dict)
 

@@ -157,6 +157,8 @@ def load_scene(
             with naming_entry("objects", number):
                 thing = _thing(entry, once, read_mesh)
                 things.append(objects.transformed(thing, entry.get("transform")))
+                if thing.dressing is not None:
+                    thing.dressing.mapped = "map" in entry
                 if film.texture_filter and thing.dressing is not None:
                     thing.dressing.pyramid = _pyramid(pyramids, entry, thing, threads)
         for number, sky in skies.items():
@@ -261,6 +263,26 @@ def _pyramid(pyramids, entry, thing, threads):
             dressing.model, dressing.shader, interpolation, weight=weight, name=entry["model"], threads=threads
         )  # fmt: skip
     return pyramids[key]
+
+
+def texture_filter_facts(scene):
+    """What the levels of detail of a rendered Scene took: bytes, seconds, errors of those that are an SVD; warnings as sentences."""
+    from btfpipe.rendering.pyramid import ERROR_BOUND
+
+    made = {id(t.dressing.pyramid): t.dressing.pyramid for t in scene.objects if t.dressing}
+    made = [pyramid for pyramid in made.values() if pyramid is not None and pyramid.made]
+    facts = {
+        "levels_bytes": sum(pyramid.nbytes for pyramid in made),
+        "levels_seconds": round(sum(pyramid.seconds for pyramid in made), 3),
+        "levels_of": [{"model": str(p.name), "levels": p.top, "bytes": p.nbytes, **p.facts} for p in made],
+        "warnings": [
+            f"{p.name}: its levels of detail are off by {100 * p.facts['relative_error']:.2g} % of the averaged texels with"
+            f" {p.facts['terms']} terms; expected at most {100 * ERROR_BOUND:g} %. --no-texture-filter does without them"
+            for p in made
+            if p.facts.get("relative_error", 0) > ERROR_BOUND
+        ],
+    }  # fmt: skip
+    return facts
 
 
 def _thing(entry, once, read_mesh):
