@@ -24,9 +24,7 @@ _RAY_BYTES = 600  # about what a ray takes, for tiles of like size in memory; fi
 
 
 def tile_side(samples, slice_bytes=0, texture_rays=False):
-    """Pixels along a tile's side at this many rays a pixel; smaller if a ray's look-up keeps so many bytes of a slice, or may need
-    texture rays.
-    """
+    """Pixels along a tile's side at this many rays a pixel; smaller for look-ups with so many bytes of a slice, or texture rays."""
     rays = _RAYS * _RAY_BYTES / (_RAY_BYTES + slice_bytes)
     if texture_rays:
         rays /= TEXTURE_TILES
