@@ -189,3 +189,24 @@ def test_levels_of_a_sample_are_its_averaged_pictures(dtype):
     views = np.tile(sample.view_directions[0], (19, 1)).astype(np.float32)
     top.shade(zero, zero, sample.light_directions.astype(np.float32), views, values)
     np.testing.assert_allclose(values, sample.pictures(slice(0, 19)).mean(axis=(1, 2)), rtol=0.02)
+
+
+def test_a_map_of_small_pieces(models, rng):
+    """Pieces of 6 x 6 texels from anywhere, each other than its neighbours: most pixels see several."""
+    from btfpipe.synthesis import CoordinateMap
+
+    y, x = np.mgrid[:96, :96]
+    row, col = rng.integers(0, 48, (2, 16, 16))
+    row, col = ((a[y // 6, x // 6] + b % 6) % 48 for a, b in ((row, y), (col, x)))
+    flat = [a.reshape(1, -1).astype(np.float32) for a in (row, col)]
+    domain = {"plane": [96, 96], "toroidal": True}
+    CoordinateMap(*flat, np.zeros_like(flat[0]), 100.0, domain).save(models / "map.npz")
+    path = plane(models, "svd.npz", 4.5, size=20, map=str(models / "map.npz"))
+    scene = yaml.safe_load(path.read_text())
+    scene["objects"][0]["plane"]["size"] = [0.96, 0.96]
+    path.write_text(yaml.safe_dump(scene))
+    truth = picture(path, 1024, False, seed=7)
+    assert error(picture(path, 16, False), truth) > 0.06
+    found = picture(path, 16, True)
+    assert error(found, truth) < 0.02
+    np.testing.assert_array_equal(picture(path, 16, True, threads=2), found)
