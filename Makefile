@@ -9,7 +9,7 @@ SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: all setup sample gallery formats data-sample test test-slow fuzz bench lint fix clean
+.PHONY: all setup sample gallery formats data-sample test test-slow fuzz mutants bench peers lint fix clean
 
 all: lint test
 
@@ -53,10 +53,20 @@ ROUNDS ?= 20
 fuzz: $(READY)
 	for round in $$(seq $(ROUNDS)); do HYPOTHESIS_PROFILE=other $(BIN)/python -m pytest -q -m hypothesis || exit 1; done
 
+# Changes of one line each, on a copy of the package, of which every one must make the tests named for it fail. ONLY: words of names or files.
+ONLY ?=
+mutants: $(READY)
+	$(BIN)/python tests/mutants/mutants.py $(ONLY)
+
 # Peers that the benchmarks time themselves against are installed here only.
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench,test,lint]"
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -s -q
+
+# Pictures and meshes beside those of other programs, which are installed here only.
+peers: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[peers,test,lint]"
+	$(BIN)/python -m pytest -m peer -s -q
 
 lint: $(READY)
 	$(BIN)/ruff check .

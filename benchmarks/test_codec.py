@@ -11,7 +11,7 @@ import numpy as np
 
 from btfpipe.compression.coded import compress_coded
 from btfpipe.compression.svd import compress_svd
-from btfpipe.directions import bonn81
+from btfpipe.directions import bonn81, from_angles
 from btfpipe.metrics import raw_bytes
 from btfpipe.metrics.comparison import compare
 from btfpipe.parallel import available_threads
@@ -19,6 +19,7 @@ from btfpipe.sample import Sample, encode
 
 SIDE = 64
 RATIOS = (25, 50, 100, 200, 400)
+MOST_QUERIES = 4.2  # of an SVD of 40 terms that one may cost: one and a half times what was read
 
 
 def say(line):
@@ -83,6 +84,45 @@ def shading_time(model, rng_seed=5, n=20_000):
     return (
         min(seconds(lambda: shader.shade(row, col, w_i, w_o, out))[1] for _ in range(5)) / n * 1e6
     )
+
+
+def neighbouring_queries(n, seed=6):
+    """What a picture under one light asks for: directions that change little from one pixel to the next."""
+    rng = np.random.default_rng(seed)
+    at = np.linspace(0, n / 200_000, n)
+    row, col = (
+        (np.repeat(rng.random(n // 50) * SIDE, 50) + np.tile(np.arange(50) * 0.1, n // 50)) % SIDE
+        for _ in range(2)
+    )
+    w_i = from_angles(0.2 + 0.8 * at, 40 * at)
+    w_o = from_angles(1.0 - 0.7 * at, 3 + 25 * at)
+    return [np.ascontiguousarray(a, np.float32) for a in (row, col, w_i, w_o)]
+
+
+def test_a_query_under_one_light_costs_few_of_an_svd_of_40_terms(benchmark):
+    """In turns, so that a ratio is of one and the same moment; the best of many short rounds."""
+    sample = relief_sample()
+    threads = available_threads()
+    shaders = {
+        "svd-40": compress_svd(sample, 40, threads=threads).shader(),
+        "coded": compress_coded(sample, threads=threads).shader(),
+    }
+    n = 2000
+    queries, out = neighbouring_queries(n), np.empty((n, 3), np.float32)
+    best = dict.fromkeys(shaders, np.inf)
+    for _ in range(60):
+        for name, shader in shaders.items():
+            best[name] = min(best[name], seconds(lambda s=shader: s.shade(*queries, out))[1])
+    ratio = best["coded"] / best["svd-40"]
+    terms = [a.shape[1] for a in shaders["coded"].angular]
+    benchmark.extra_info.update({name: 1e6 * t / n for name, t in best.items()}, ratio=ratio)
+    say(
+        f"a query under one light, {SIDE} x {SIDE}, terms {terms}: "
+        + ", ".join(f"{name} {1e6 * t / n:.2f} us" for name, t in best.items())
+        + f", ratio {ratio:.1f}"
+    )
+    benchmark.pedantic(shaders["coded"].shade, (*queries, out), rounds=3)
+    assert ratio < MOST_QUERIES
 
 
 def test_more_decibels_at_equal_bytes(benchmark, tmp_path):

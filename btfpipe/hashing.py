@@ -1,7 +1,9 @@
 """Random numbers as a function of (seed, item, draw): the same for any order and number of threads."""
 
 import numpy as np
-from numba import njit, uint64
+from numba import uint64
+
+from btfpipe.compiled import njit
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)

@@ -3,7 +3,8 @@
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 # A level padded by half a neighbourhood. `labels` (rows + 2 h, cols + 2 h) int32; squared distances come from `table` (n + 1, n + 1),
 # or, where that is empty, from `image` (rows + 2 h, (cols + 2 h) d). With `clip` places outside do not count: their distances in

@@ -239,7 +239,7 @@ def representative_pictures(textures, angular, toroidal, count, seed=0, threads=
     Returns
     -------
     (min(count, pairs),) int
-        In ascending order.
+        In ascending order; fewer if pictures coincide.
     """
     if count >= len(angular):
         return np.arange(len(angular))
@@ -254,8 +254,8 @@ def representative_pictures(textures, angular, toroidal, count, seed=0, threads=
         matrix += grid @ grid.T
     vectors = (angular @ _root(matrix).astype(np.float32)).reshape(len(angular), -1)
     reduced, _ = reduce(vectors, _CLUSTER_DIMENSIONS, seed)
-    _, labels = _kmeans(reduced, count, seed)
-    centres = _means(vectors, labels, count)
+    found, labels = _kmeans(reduced, count, seed)
+    centres = _means(vectors, labels, found)
     distance = _distances_to(vectors, centres, labels)
     order = np.lexsort((distance, labels))
     first = np.concatenate([[True], labels[order][1:] != labels[order][:-1]])

@@ -11,6 +11,7 @@ from btfpipe.cli.options import (
     material_taken,
     progress,
     stage,
+    warn,
 )
 from btfpipe.errors import naming
 
@@ -112,7 +113,9 @@ def synthesize(
     """Grow a Sample over a Surface, or over a plane (Tong et al. 2002).
 
     FEATURES is what `btfpipe textons` made; or a feature image (.npy or a picture), a Sample or a Model, whose texels are
-    then compared without textons. The result says which texel of the sample goes to each vertex.
+    then compared without textons. The result says which texel of the sample goes to each vertex. A
+    material that runs in one direction, such as cords, is warned of where the field would break its pattern and the field
+    turned by 90 degrees would not.
 
     \b
     Examples:
@@ -122,6 +125,7 @@ def synthesize(
     from btfpipe import store
     from btfpipe.surface import Surface
     from btfpipe.synthesis.coherence import coherence_facts
+    from btfpipe.synthesis.field_fit import judge_field
     from btfpipe.synthesis.growth import grow_over_surface, scale_for
     from btfpipe.synthesis.plane import grow_over_plane
     from btfpipe.synthesis.sources import read_features
@@ -144,12 +148,15 @@ def synthesize(
         "full": full, "k": k, "levels": levels, "sweeps": sweeps, "coherence": coherence, "seed": seed,
         "distance": distance,
     }  # fmt: skip
+    fit, doubts = {}, []
     both = f"{features} on {surface or 'a plane'}"
     with naming(both), progress("synthesize", quiet) as report:
         if plane:
             grown = grow_over_plane(sample, plane, on_progress=report, **common)
         else:
             scale = scale_for(target, sample.levels[0].shape, texels_per_unit, repeats)
+            fit, doubts = judge_field(sample, target.levels[0], scale, math.radians(turn_deg))
+            warn(*doubts)
             grown = grow_over_surface(
                 sample, target, scale, turn=math.radians(turn_deg), threads=threads,
                 memory=memory, on_progress=report, **common,
@@ -171,6 +178,8 @@ def synthesize(
         "elements": grown.row.shape[1],
         "texels_per_unit": grown.texels_per_unit,
         **facts,
+        **fit,
+        "warnings": doubts,
         "candidates": steps[-1]["candidates"],
         "mean_distance": steps[-1]["mean_distance"],
         "fallbacks": sum(step["fallbacks"] for step in steps),

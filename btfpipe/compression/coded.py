@@ -112,16 +112,19 @@ class CodedModel(Model):
         out = np.empty((len(angular[0]), len(texture), 3), np.float32)
         for part in blocks(len(texture), _TEXELS):
             roots = [a @ texture[part, : a.shape[1]].T for a in angular]
-            square(*roots, self.colour, out[:, part])
+            to_channels(*roots, self.colour, out[:, part])
+            square(out[:, part])
         return out.reshape(-1, *self.shape, 3)
 
     def texels(self, rows, cols):
-        return values_of(self.texture_factors[rows, cols], self.angular_factors, self.colour)
+        out = roots_of(self.texture_factors[rows, cols], self.angular_factors, self.colour)
+        square(out)
+        return out
 
     @classmethod
     def shading_needs(cls, reader):
         from btfpipe.compression.coded_shading import MANY_LIGHTS
-        from btfpipe.sample.light_slices import slice_bytes
+        from btfpipe.compression.light_slices import slice_bytes
 
         shape, terms = _sizes(reader)
         source = read_tables(reader)
@@ -131,8 +134,9 @@ class CodedModel(Model):
         if "view_basis" in reader:
             shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
         # each is unpacked into one array and laid out anew in another
+        products = 20 * math.prod(shape)
         levels = svd_levels(math.prod(shape), len(source.light_index))
-        return ShadingNeeds(texture + angular, max(texture, angular), *shared, **levels)
+        return ShadingNeeds(texture + angular + products, max(texture, angular), *shared, **levels)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader
@@ -155,26 +159,34 @@ def _sizes(reader):
     return whole
 
 
-def values_of(texture, angular, colour):
-    """Values (n, m, 3) float32 of texels' factors (n, terms) with three angular factors (m, at most as many terms)."""
+def roots_of(texture, angular, colour):
+    """Roots (n, m, 3) float32 of texels' factors (n, terms) with three angular factors (m, at most as many terms)."""
     roots = [texture[:, : a.shape[1]] @ a.T for a in angular]
     out = np.empty((len(texture), len(angular[0]), 3), np.float32)
-    square(*roots, colour, out)
+    to_channels(*roots, colour, out)
     return out
 
 
 @leaf(fastmath={"contract"})
-def square(first, second, third, colour, out):
-    """Fill `out` (n, m, 3) with the values of the roots (n, m) of three colours."""
+def to_channels(first, second, third, colour, out):
+    """Fill `out` (n, m, 3) with the channels' roots, of those (n, m) of three colours."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             for c in range(3):
-                root = (
+                out[i, j, c] = (
                     colour[c, 0] * first[i, j]
                     + colour[c, 1] * second[i, j]
                     + colour[c, 2] * third[i, j]
                 )
-                out[i, j, c] = root * abs(root)
+
+
+@leaf
+def square(roots):
+    """Turn roots (n, m, 3) into values, in place; they keep their sign."""
+    for i in range(roots.shape[0]):
+        for j in range(roots.shape[1]):
+            for c in range(3):
+                roots[i, j, c] *= abs(roots[i, j, c])
 
 
 def compress_coded(
@@ -356,8 +368,8 @@ class _Packer:
         """Members and description for a step."""
         texture = _quantise(self.texture, step)
         angular = _quantise(self.angular, step)
-        least = max(1, angular[0, 0].size // _SPARSE)
-        live = [_live(texture, 0), *(_live(part, 0, least) for part in angular)]
+        least = angular[0, 0].size / _SPARSE
+        live = [_live(texture, 0), *(_worthwhile(part, least) for part in angular)]
         n = max(1, min(live[0], max(live[1:])))
         terms = [n, *(max(1, min(n, part)) for part in live[1:])]
         angular = [part[:k] for part, k in zip(angular, terms[1:], strict=True)]
@@ -433,6 +445,14 @@ def _live(planes, axis, least=1):
     others = tuple(a for a in range(planes.ndim) if a != axis)
     found = np.flatnonzero(np.count_nonzero(planes, axis=others) >= least)
     return int(found[-1]) + 1 if len(found) else 0
+
+
+def _worthwhile(planes, least):
+    """How many terms there are before those that have on average fewer numbers other than 0 than `least`."""
+    counts = np.count_nonzero(planes, axis=(1, 2))[::-1]
+    average = np.cumsum(counts) / np.arange(1, len(counts) + 1)
+    few = np.flatnonzero(average < least)
+    return len(counts) - (int(few[-1]) + 1 if len(few) else 0)
 
 
 def _file_bytes(members, source, about):

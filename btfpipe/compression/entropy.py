@@ -13,9 +13,8 @@ import math
 import zlib
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.errors import InputError
 
 _LEVELS = 10  # classes of neighbours in the plane

@@ -8,9 +8,8 @@ relative to the value.
 import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise, left_out, pictures_to_read, planar_pictures
 from btfpipe.errors import InputError

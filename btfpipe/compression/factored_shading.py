@@ -1,8 +1,8 @@
 """Shading from a `FactoredModel`: decode each pair at each texel, then blend; linear spaces blend first."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.compression.factored import SPACES, decode_colour
 from btfpipe.sample.shading import PairShader, corners
 

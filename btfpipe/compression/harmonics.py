@@ -19,9 +19,9 @@ Work goes by scan lines (section 5.2), twice: for the range of each coefficient,
 import math
 
 import numpy as np
-from numba import njit
 
 from btfpipe import store
+from btfpipe.compiled import njit
 from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.directions.spherical_harmonics import highest_degree, spherical_harmonics
 from btfpipe.errors import InputError, too_little

@@ -1,10 +1,15 @@
-"""Shading from a `HarmonicsModel`: the harmonics of a light and a view, contracted with a texel's codes."""
+"""Shading from a `HarmonicsModel`: the harmonics of a light and a view, contracted with a texel's codes.
+
+Harmonics say nothing of use beyond the directions that they were fitted to: they ring. Beyond the largest measured polar
+angle they are therefore evaluated at that angle, for lights as for views; and the value fades with the light's cosine, so
+that value / cos(theta_i) stays what it is at the last measured ring.
+"""
+
+import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
-from btfpipe.directions.pairs import lifted
+from btfpipe.compiled import leaf, njit
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,
     highest_degree,
@@ -26,6 +31,7 @@ class HarmonicsShader:
     """
 
     many_lights = MANY_LIGHTS
+    linear_slices = True  # may be averaged
 
     def __init__(self, model):
         self.rows, self.cols = model.shape
@@ -37,6 +43,9 @@ class HarmonicsShader:
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
         self.slice_bytes = slice_bytes(model.light_terms)
+        self.least_view, self.least_light = (
+            least_cosine(d) for d in (model.view_directions, model.light_directions)
+        )
 
     def halved(self, halving):
         """The shader of the next level of a `Pyramid`: codes of 16 bits, as means of codes lie between them."""
@@ -50,8 +59,8 @@ class HarmonicsShader:
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
         _shade(
-            self.codes, self.minimum, self.step, self.view_table, self.light_table,
-            self.rows, self.cols, self.toroidal, row, col, w_i, lifted(w_o), out,
+            self.codes, self.minimum, self.step, self.view_table, self.light_table, self.least_view, self.least_light,
+            self.rows, self.cols, self.toroidal, row, col, w_i, w_o, out,
         )  # fmt: skip
 
     def slices(self, row, col, w_o):
@@ -75,16 +84,41 @@ class HarmonicSlices:
     """
 
     def __init__(self, shader, row, col, w_o):
-        self.table = shader.light_table
+        self.table, self.least = shader.light_table, shader.least_light
         self.values = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
         _slice(
-            shader.codes, shader.minimum, shader.step, shader.view_table, shader.rows, shader.cols, shader.toroidal,
-            row, col, lifted(w_o), self.values,
+            shader.codes, shader.minimum, shader.step, shader.view_table, shader.least_view,
+            shader.rows, shader.cols, shader.toroidal, row, col, w_o, self.values,
         )  # fmt: skip
 
     def shade(self, chosen, w_i, out):
         """Fill `out`; see `Appearance.shader`."""
-        _sum(self.values, self.table, chosen, w_i, out)
+        _sum(self.values, self.table, self.least, chosen, w_i, out)
+
+
+def least_cosine(directions):
+    """Cosine of the largest polar angle of measured directions (n, 3)."""
+    return max(float(np.min(np.asarray(directions, np.float64)[:, 2])), 0.0)
+
+
+@leaf
+def clamp_to_cap(direction, least, out):
+    """Fill ``out`` (3,) with a direction, or with the one above it whose cosine is `least`.
+
+    Returns the direction's cosine over that of ``out``: 1 within the cap.
+    """
+    z = float(direction[2])
+    if z >= least:
+        out[0] = direction[0]
+        out[1] = direction[1]
+        out[2] = z
+        return 1.0
+    across = direction[0] * float(direction[0]) + direction[1] * float(direction[1])
+    scale = math.sqrt((1.0 - least * least) / max(across, 1e-30))
+    out[0] = scale * direction[0]
+    out[1] = scale * direction[1]
+    out[2] = least
+    return z / least if least > 0.0 else 0.0
 
 
 @leaf(fastmath=FAST)
@@ -125,8 +159,9 @@ def contract(codes, texel, share, weights, base, q, out):
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _shade(
-    codes, minimum, step, view_table, light_table, rows, cols, toroidal, row, col, w_i, w_o, out
-):
+    codes, minimum, step, view_table, light_table, least_view, least_light, rows, cols, toroidal, row, col, w_i, w_o,
+    out,
+):  # fmt: skip
     view = np.empty(view_table.shape[0] ** 2, np.float32)
     light = np.empty(light_table.shape[0] ** 2, np.float32)
     products = np.empty(minimum.shape[1], np.float32)
@@ -134,27 +169,34 @@ def _shade(
     base = np.empty(3, np.float32)
     texel = np.zeros(4, np.int64)
     share = np.zeros(4, np.float32)
+    at = np.empty(3)
     for q in range(len(row)):
         if not w_i[q, 2] > 0.0:
             out[q, :] = 0.0
             continue
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
-        fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
-        fill_harmonics(float(w_i[q, 0]), float(w_i[q, 1]), float(w_i[q, 2]), light_table, light)
+        clamp_to_cap(w_o[q], least_view, at)
+        fill_harmonics(at[0], at[1], at[2], view_table, view)
+        fade = np.float32(clamp_to_cap(w_i[q], least_light, at))
+        fill_harmonics(at[0], at[1], at[2], light_table, light)
         multiply(view, light, products)
         for c in range(3):
             weigh(products, minimum, step, c, weights, base)
         contract(codes, texel, share, weights, base, q, out)
+        for c in range(3):
+            out[q, c] *= fade
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _slice(codes, minimum, step, view_table, rows, cols, toroidal, row, col, w_o, out):
+def _slice(codes, minimum, step, view_table, least, rows, cols, toroidal, row, col, w_o, out):
     view = np.empty(view_table.shape[0] ** 2, np.float32)
     texel = np.zeros(4, np.int64)
     share = np.zeros(4, np.float32)
+    at = np.empty(3)
     for q in range(len(row)):
         corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
-        fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
+        clamp_to_cap(w_o[q], least, at)
+        fill_harmonics(at[0], at[1], at[2], view_table, view)
         for c in range(3):
             _contract_view(codes, minimum, step, c, view, texel, share, out[q, c])
 
@@ -185,16 +227,18 @@ def _contract_view(codes, minimum, step, c, view, texel, share, out):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _sum(coefficients, light_table, chosen, w_i, out):
+def _sum(coefficients, light_table, least, chosen, w_i, out):
     light = np.empty(light_table.shape[0] ** 2, np.float32)
+    at = np.empty(3)
     for q in range(len(chosen)):
         if not w_i[q, 2] > 0.0:
             out[q, :] = 0.0
             continue
-        fill_harmonics(float(w_i[q, 0]), float(w_i[q, 1]), float(w_i[q, 2]), light_table, light)
+        fade = np.float32(clamp_to_cap(w_i[q], least, at))
+        fill_harmonics(at[0], at[1], at[2], light_table, light)
         for c in range(3):
             some = coefficients[chosen[q], c]
             total = np.float32(0)
             for j in range(len(light)):
                 total += light[j] * some[j]
-            out[q, c] = total
+            out[q, c] = fade * total

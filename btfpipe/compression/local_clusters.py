@@ -9,8 +9,8 @@ clusters are found from a random part of the points; a few rounds over all of th
 """
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 
 POINTS = 2048  # compared with all clusters at a time; fixed, as rounding hangs on it

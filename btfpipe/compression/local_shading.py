@@ -1,8 +1,8 @@
 """Pictures and shading from clusters of texels, each with its own basis."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.sample.shading import PairShader, corners
 
 

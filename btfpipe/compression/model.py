@@ -4,9 +4,9 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from numba import njit
 
 from btfpipe import store
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError, naming
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
 from btfpipe.sample.appearance import Appearance

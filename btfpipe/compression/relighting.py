@@ -13,8 +13,8 @@ the value is 0.
 from types import SimpleNamespace
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.compression.model import Model
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError

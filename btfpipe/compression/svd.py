@@ -13,8 +13,8 @@ wanted ones die out faster (Feng and Yu 2023).
 import math
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.compression.model import Model, measured_error, require_summable, sum_of_squares
 from btfpipe.errors import InputError, too_little
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas

@@ -8,9 +8,9 @@ eigen-textures follow from its small Gram matrix of lights x lights.
 import math
 
 import numpy as np
-from numba import njit
 
 from btfpipe import store
+from btfpipe.compiled import njit
 from btfpipe.compression.model import (
     MOST_ENERGY,
     Model,

@@ -8,8 +8,8 @@ those of the nearest point of the hull.
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError
 
 # What a compiled kernel needs of a Hemisphere; all in the stereographic plane but `vectors`.

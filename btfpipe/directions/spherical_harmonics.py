@@ -9,9 +9,8 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.directions.sets import from_angles
 from btfpipe.errors import InputError
 

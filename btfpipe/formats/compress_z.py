@@ -10,9 +10,8 @@ Welch 1984, A Technique for High-Performance Data Compression.
 """
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.errors import InputError
 
 MAGIC = b"\x1f\x9d"

@@ -3,8 +3,8 @@
 import functools
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.sample.transfer import encode
 
 WINDOW = 11

@@ -9,8 +9,8 @@ inscribed circle, on which every point is +z.
 import heapq
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError
 from btfpipe.hashing import uniform
 

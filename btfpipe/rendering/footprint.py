@@ -18,9 +18,8 @@ import copy
 import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.hashing import uniform
 
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
@@ -483,7 +482,12 @@ class Footprints:
             self.steps,
         )  # fmt: skip
 
-    def average(self, chosen, evaluate, out):
+    @property
+    def linear_slices(self):
+        """Whether slices of the look-ups can be averaged: those of square roots cannot."""
+        return getattr(self.pyramid.level(0), "linear_slices", False)
+
+    def average(self, chosen, evaluate, out, shade_factors=None):
         """Average over the footprints of some look-ups.
 
         Parameters
@@ -495,6 +499,9 @@ class Footprints:
             `which` (p,) numbers them along `chosen`.
         out : (m, ...) float32
             Filled in place.
+        shade_factors : callable, optional
+            ``shade_factors(shader, which, factors)`` gives values of factors that were averaged, of shaders that have some;
+            those of one `Pyramid` have the same terms.
         """
         ends = np.empty(len(chosen), np.int64)
         _count_probes(chosen, self.first, self.count, self.share, ends)
@@ -512,14 +519,25 @@ class Footprints:
                 self.steps, owner, row, col, level, weight,
             )  # fmt: skip
             owner += start
-            for number in np.unique(level):
+            factors, last, touched = None, None, np.zeros(stop - start, bool)
+            for number in np.flatnonzero(np.bincount(level)):
                 shader = self.pyramid.level(int(number))
                 some = np.flatnonzero(level == number)
                 which = owner[some]
-                values = evaluate(
-                    shader, which, *self._coordinates(shader, number, row[some], col[some])
-                )
-                _add(values.reshape(len(values), -1), which, weight[some], flat)
+                at = self._coordinates(shader, number, row[some], col[some])
+                if shade_factors is not None and hasattr(shader, "add_factors"):
+                    if factors is None:
+                        factors = np.zeros((stop - start, shader.texture.shape[1]), np.float32)
+                    shader.add_factors(*at, weight[some], which - start, factors)
+                    touched[which - start] = True
+                    last = shader
+                else:
+                    values = evaluate(shader, which, *at)
+                    _add(values.reshape(len(values), -1), which, weight[some], flat)
+            if factors is not None:
+                rows = np.flatnonzero(touched)
+                values = shade_factors(last, start + rows, factors[rows])
+                _add(values, start + rows, np.ones(len(rows), np.float32), flat)
             start = stop
 
     def _coordinates(self, shader, number, row, col):
@@ -540,7 +558,12 @@ class Footprints:
             shader.shade(row, col, w_i[which], w_o[which], values)
             return values
 
-        self.average(chosen, evaluate, out)
+        def shade_factors(shader, which, factors):
+            values = np.empty((len(which), 3), np.float32)
+            shader.shade_factors(factors, w_i[which], w_o[which], values)
+            return values
+
+        self.average(chosen, evaluate, out, shade_factors)
 
     def slices(self, w_o):
         """What all look-ups show whatever the light; see `Appearance.shader`."""

@@ -5,6 +5,9 @@ products of two harmonics over it, takes the environment's coefficients e there,
 local frame. The hemisphere couples degrees, so that e may have more terms than c: with as many (the paper's form) what a
 sharper light adds is lost. There is no shadow but the one given.
 
+Beyond the last measured ring of lights A holds not what the harmonics say there but what `HarmonicsShader` makes of them: their value at
+the ring, fading with the light's cosine. That is linear in c and keeps the azimuth, so that A has elements in the same places.
+
 R is three turns, about n, t and n. A turn about n mixes two coefficients at a time; one about t is one about n between
 two quarter turns, whose fixed, sparse matrices are made once by the recursion. Points go through this in groups, side by side.
 """
@@ -13,21 +16,19 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 
-from btfpipe.compiled import leaf
+from btfpipe.compiled import leaf, njit
 from btfpipe.compression.harmonics import HarmonicsModel
 from btfpipe.compression.harmonics_shading import (
     FAST,
     HarmonicsShader,
+    clamp_to_cap,
     contract,
     multiply,
     weigh,
 )
-from btfpipe.directions.pairs import lifted
 from btfpipe.directions.spherical_harmonics import (
     fill_harmonics,
-    hemisphere_products,
     highest_degree,
     rotation_blocks,
     spherical_harmonics,
@@ -37,6 +38,7 @@ from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.shading import corners
 
 _PIXELS = 1 << 14  # of a map, projected at a time
+_NODES = 64  # of a quadrature beyond those of a polynomial: odd orders hold a root
 _GROUP = 16  # points worked on side by side: a register's width
 # turns n into t, so that a turn about t is one about n between two turns by this
 _ASIDE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -108,7 +110,7 @@ class HarmonicEnvironment:
         self.occlusion_rays = occlusion_rays
         self.shader = HarmonicsShader(model)
         self.environment = np.ascontiguousarray(coefficients[:terms], np.float32)
-        self.coupling = _coupling(model.light_terms, terms)
+        self.coupling = _coupling(model.light_terms, terms, self.shader.least_light)
         self.quarters = (*_quarter(terms, False), *_quarter(terms, True))
 
     def shade(self, row, col, frames, w_o, out, visibility=None):
@@ -129,25 +131,48 @@ class HarmonicEnvironment:
             A factor a point: the share of the environment that no object hides, by any measure.
         """
         shader = self.shader
-        w_o = lifted(w_o)
         if visibility is None:
             visibility = np.ones(len(row), np.float32)
         _shade(
-            shader.codes, shader.minimum, shader.step, shader.view_table,
+            shader.codes, shader.minimum, shader.step, shader.view_table, shader.least_view,
             self.environment, self.quarters, self.coupling, shader.rows, shader.cols, shader.toroidal, row, col, frames, w_o, visibility, out,
         )  # fmt: skip
 
 
 @functools.lru_cache(maxsize=8)
-def _coupling(light_terms, terms):
-    """A / pi as (light terms, degrees of the environment) float32: its only elements, those of one order."""
-    products = hemisphere_products(light_terms, terms) / math.pi
+def _coupling(light_terms, terms, least):
+    """A / pi as (light terms, degrees of the environment) float32: its only elements, those of one order.
+
+    Rows are the light's harmonics up to the cosine `least`; below, those at that cosine times cos(theta_i) / least.
+    """
+    height, weight = _heights(highest_degree(light_terms) + highest_degree(terms), least)
+    # a harmonic of order m is what it is at azimuth 0, or that of -m is, times cos(m phi) or sin(|m| phi)
+    light = _meridian(np.maximum(height, least), light_terms)
+    light *= np.minimum(height / max(least, 1e-30), 1)[:, None]
+    products = (weight[:, None] * light).T @ _meridian(height, terms)
     out = np.zeros((light_terms, highest_degree(terms) + 1), np.float32)
     for l in range(highest_degree(light_terms) + 1):  # noqa: E741
         for m in range(-l, l + 1):
             for other in range(abs(m), out.shape[1]):
-                out[l * (l + 1) + m, other] = products[l * (l + 1) + m, other * (other + 1) + m]
+                around = 1 if m else 2  # the integral of the squared cosine or sine, over pi
+                product = products[l * (l + 1) + abs(m), other * (other + 1) + abs(m)]
+                out[l * (l + 1) + m, other] = around * product
     return out
+
+
+def _heights(degree, least):
+    """Nodes and weights over the cosine from 0 to 1, on either side of a kink at `least`; on the cap exact up to a degree."""
+    node, weight = np.polynomial.legendre.leggauss(degree + _NODES)
+    parts = [
+        (a + (b - a) * (node + 1) / 2, (b - a) * weight / 2) for a, b in ((0, least), (least, 1))
+    ]
+    return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+
+
+def _meridian(height, terms):
+    """Harmonics (n, terms) at azimuth 0 and the given cosines (n,)."""
+    sine = np.sqrt(np.maximum(1 - height**2, 0))
+    return spherical_harmonics(np.stack([sine, 0 * height, height], axis=1), terms)
 
 
 @functools.lru_cache(maxsize=8)
@@ -267,7 +292,7 @@ def _mirror(hand, most, light):
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _shade(
-    codes, minimum, step, view_table, environment, quarters, coupling,
+    codes, minimum, step, view_table, least_view, environment, quarters, coupling,
     rows, cols, toroidal, row, col, frames, w_o, visibility, out,
 ):  # fmt: skip
     first, columns, elements, first_back, columns_back, elements_back = quarters
@@ -287,6 +312,7 @@ def _shade(
     base = np.empty(3, np.float32)
     texel = np.zeros(4, np.int64)
     share = np.zeros(4, np.float32)
+    seen_from = np.empty(3)
     for start in range(0, len(row), _GROUP):
         for p in range(_GROUP):
             hand[p] = _angles(frames, min(start + p, len(row) - 1), p, turns)
@@ -302,7 +328,8 @@ def _shade(
         _mirror(hand, most, lights)
         for q in range(start, min(start + _GROUP, len(row))):
             corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, share)
-            fill_harmonics(float(w_o[q, 0]), float(w_o[q, 1]), float(w_o[q, 2]), view_table, view)
+            clamp_to_cap(w_o[q], least_view, seen_from)
+            fill_harmonics(seen_from[0], seen_from[1], seen_from[2], view_table, view)
             for c in range(3):
                 for i in range(len(light)):
                     light[i] = lights[i, c, q - start]

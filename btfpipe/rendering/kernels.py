@@ -1,9 +1,14 @@
 """Compiled steps of the renderer, over the rays of one tile. Flat arrays in, given arrays filled."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.hashing import uniform
+
+# Positions in single precision are less than this far off, as a fraction of a face's largest coordinate.
+_ROUNDING = 4e-6
+# A shadow ray to a point light ends this fraction before it: nothing that the lamp lies on blocks it.
+_SHORTER = 1e-5
 
 
 @njit(cache=True, nogil=True)
@@ -44,8 +49,44 @@ def camera_rays(
 
 
 @njit(cache=True, nogil=True)
+def _shadow_start(f, share, side, gx, gy, gz, vertices, faces, normals, point, start):
+    """Fill `start` (3,): a point of face f moved onto the face's Phong surface, and off it by the rounding.
+
+    Hanika 2021, Hacking the shadow terminator (Ray Tracing Gems II, chapter 4): the barycentric mean of the
+    point's projections onto those tangent planes of the vertices that it lies below, as seen from the face's
+    `side` (1 or -1), to which its unit normal g points. The offset of a point depends on its own face alone.
+    """
+    x, y, z = point[0], point[1], point[2]
+    ox = 0.0
+    oy = 0.0
+    oz = 0.0
+    largest = 0.0
+    for k in range(3):
+        i = faces[f, k]
+        below = side * (
+            (vertices[i, 0] - x) * normals[i, 0]
+            + (vertices[i, 1] - y) * normals[i, 1]
+            + (vertices[i, 2] - z) * normals[i, 2]
+        )
+        if below > 0.0:
+            scale = share[k] * below * side
+            ox += scale * normals[i, 0]
+            oy += scale * normals[i, 1]
+            oz += scale * normals[i, 2]
+        for c in range(3):
+            largest = max(largest, abs(vertices[i, c]))
+    if ox * gx + oy * gy + oz * gz < 0.0:
+        # normals that point to the face's other side describe no surface on this one
+        ox, oy, oz = 0.0, 0.0, 0.0
+    rounding = _ROUNDING * largest + 1e-30
+    start[0] = x + ox + rounding * gx
+    start[1] = y + oy + rounding * gy
+    start[2] = z + oz + rounding * gz
+
+
+@njit(cache=True, nogil=True)
 def surface_points(
-    hits, prim, origins, directions, vertices, faces, normals, clearance, smallest,
+    hits, prim, origins, directions, vertices, faces, normals,
     share, point, start, normal, facing, depth,
 ):  # fmt: skip
     """What shading needs of each hit.
@@ -56,15 +97,11 @@ def surface_points(
         Rays that hit.
     prim : (rays,) int32
         Face of each ray.
-    clearance : (vertices,) float64
-        See `clearance.clearance`.
-    smallest : float
-        Distance that rounding of positions cannot bridge.
     share : (n, 3) float64
         Filled: barycentric coordinates, found again in double precision.
     point, start : (n, 3) float64
-        Filled: the point, and where its shadow rays start: on the smooth surface that the shading normals describe
-        rather than on the facet (Hanika 2021), so that facets do not show where light grazes.
+        Filled: the point, and where its shadow rays start (`_shadow_start`), so that a coarse face does not show
+        where light grazes.
     normal : (n, 3) float64
         Filled: shading normal, towards the ray's side of the face.
     facing : (n,) float64
@@ -114,9 +151,10 @@ def surface_points(
         nz = u * normals[a, 2] + v * normals[b, 2] + w * normals[c, 2]
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         area = np.sqrt(gx * gx + gy * gy + gz * gz)
-        gx /= area
-        gy /= area
-        gz /= area
+        if area > 0.0:
+            gx /= area
+            gy /= area
+            gz /= area
         if length < 1e-12:
             nx, ny, nz, length = gx, gy, gz, 1.0
         side = 1.0 if along < 0.0 else -1.0
@@ -139,26 +177,7 @@ def surface_points(
         depth[h] = (
             (x - origins[ray, 0]) * dx + (y - origins[ray, 1]) * dy + (z - origins[ray, 2]) * dz
         )
-        # towards the planes through the vertices across their normals
-        ox = 0.0
-        oy = 0.0
-        oz = 0.0
-        for k in range(3):
-            i = faces[f, k]
-            below = side * (
-                (vertices[i, 0] - x) * normals[i, 0]
-                + (vertices[i, 1] - y) * normals[i, 1]
-                + (vertices[i, 2] - z) * normals[i, 2]
-            )
-            if below > 0.0:
-                scale = share[h, k] * below * side
-                ox += scale * normals[i, 0]
-                oy += scale * normals[i, 1]
-                oz += scale * normals[i, 2]
-        lift = smallest + u * clearance[a] + v * clearance[b] + w * clearance[c]
-        start[h, 0] = x + ox + lift * gx
-        start[h, 1] = y + oy + lift * gy
-        start[h, 2] = z + oz + lift * gz
+        _shadow_start(f, share[h], side, gx, gy, gz, vertices, faces, normals, point[h], start[h])
 
 
 @njit(cache=True, nogil=True)
@@ -175,18 +194,12 @@ def light_rays(
         x, y, z = place[0], place[1], place[2]
         falloff = 1.0
         length = 1.0
-        away = 1e30
         if not directional:
             x -= point[h, 0]
             y -= point[h, 1]
             z -= point[h, 2]
             falloff = max(x * x + y * y + z * z, 1e-30)
             length = np.sqrt(falloff)
-            away = np.sqrt(
-                (place[0] - start[h, 0]) ** 2
-                + (place[1] - start[h, 1]) ** 2
-                + (place[2] - start[h, 2]) ** 2
-            )
         w_i[h, 0] = x / length
         w_i[h, 1] = y / length
         w_i[h, 2] = z / length
@@ -194,9 +207,20 @@ def light_rays(
             irradiance[h, c] = power[c] / falloff
         if w_i[h, 0] * normal[h, 0] + w_i[h, 1] * normal[h, 1] + w_i[h, 2] * normal[h, 2] > 0.0:
             lit[count] = h
-            for c in range(3):
-                origin[count, c] = start[h, c]
-                toward[count, c] = w_i[h, c]
+            away = 1e30
+            if not directional:
+                # from where the shadow ray starts, so that it ends at the lamp and not beside it
+                x = place[0] - start[h, 0]
+                y = place[1] - start[h, 1]
+                z = place[2] - start[h, 2]
+                length = max(np.sqrt(x * x + y * y + z * z), 1e-30)
+                away = length * (1.0 - _SHORTER)
+            origin[count, 0] = start[h, 0]
+            origin[count, 1] = start[h, 1]
+            origin[count, 2] = start[h, 2]
+            toward[count, 0] = x / length
+            toward[count, 1] = y / length
+            toward[count, 2] = z / length
             far[count] = away
             count += 1
     return count

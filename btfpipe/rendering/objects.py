@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError
 from btfpipe.synthesis.coherence import find_coherent
 

@@ -104,25 +104,36 @@ class Halving:
 
 
 def _taps(n, m, toroidal):
-    """Which of n texels make up each of m, about half as many: index (m, 5) int64 and weight (m, 5) float64.
+    """Which of n texels make up each of m, about half as many: index (m, k) int64 and weight (m, k) float64.
 
-    The means over what each covers of the n texels, once these are smoothed by (1, 2, 1) / 4: of an even n (1, 3, 3, 1) / 8.
+    Of an even n (1, 3, 3, 1) / 8. Of an odd one a smooth kernel as wide (its variance is that of (1, 3, 3, 1) / 8 where n is
+    2 m): the indicator of what a texel covers, widened by a triangle two texels wide and by (1, 6, 1) / 8. In either case
+    the weights of each texel of the m sum to 1, those that each of the n has in all of the m to m / n, and a ramp stays a
+    ramp.
     """
-    index, weight = np.zeros((m, 5), np.int64), np.zeros((m, 5))
-    for k in range(m):
-        left, right = k * n / m, (k + 1) * n / m
-        first = int(left + 1e-9)
-        covered = [
-            max(min(right, i + 1) - max(left, i), 0) / (right - left)
-            for i in range(first, first + 3)
-        ]
-        weight[k] = np.convolve(covered, [0.25, 0.5, 0.25])
-        index[k] = np.arange(first - 1, first + 4)
+    if n == 1:
+        return np.zeros((m, 1), np.int64), np.ones((m, 1))
+    if n % 2 == 0:
+        first = 2 * np.arange(m) - 1
+        weight = np.tile(np.array([1, 3, 3, 1]) / 8, (m, 1))
+    else:
+        centre = (np.arange(m) + 0.5) * n / m - 0.5
+        first = np.floor(centre).astype(np.int64) - 3
+        offset = first[:, None] + np.arange(1, 7) - centre[:, None]
+        half = n / m / 2
+        covered = (_triangle_below(offset + half) - _triangle_below(offset - half)) / (2 * half)
+        weight = np.array([np.convolve(some, [1 / 8, 6 / 8, 1 / 8]) for some in covered])
+    index = first[:, None] + np.arange(weight.shape[1])
     if toroidal:
         return index % n, weight
-    return np.clip(
-        np.where(index < 0, -1 - index, np.where(index >= n, 2 * n - 1 - index, index)), 0, n - 1
-    ), weight
+    index %= 2 * n  # mirrored at the borders
+    return np.where(index < n, index, 2 * n - 1 - index), weight
+
+
+def _triangle_below(x):
+    """Integral of the triangle of unit height over [-1, 1], up to x."""
+    x = np.clip(x, -1, 1)
+    return np.where(x < 0, (1 + x) ** 2 / 2, 1 - (1 - x) ** 2 / 2)
 
 
 @leaf

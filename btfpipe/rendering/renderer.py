@@ -5,7 +5,6 @@ import numpy as np
 from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
-from btfpipe.rendering.clearance import clearance
 from btfpipe.rendering.footprint import (
     Footprints,
     count_texture_rays,
@@ -65,9 +64,6 @@ class Renderer:
         self.seed = seed
         self.vertices = np.concatenate([t.vertices for t in scene.objects])
         self.normals = np.concatenate([t.normals for t in scene.objects])
-        self.clearance = np.concatenate(
-            [clearance(t.vertices, t.faces, t.normals) for t in scene.objects]
-        )
         first_vertex = np.cumsum([0] + [len(t.vertices) for t in scene.objects])
         self.first_face = np.cumsum([0] + [len(t.faces) for t in scene.objects])
         self.faces = np.concatenate(
@@ -81,8 +77,6 @@ class Renderer:
         self.table = filter_table(scene.film.filter, scene.film.radius)
         rows, cols = strata(scene.film.samples)
         self.parts = strata_parts(self.table, cols), strata_parts(self.table, rows)
-        # single precision positions are this far off at the scene's size
-        self.smallest = 4e-6 * float(np.abs(self.vertices).max() + 1e-30)
         self.tree = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self.tree, self.vertices.astype(np.float32), self.faces)
         ray = np.zeros((1, 3), np.float32)
@@ -163,7 +157,7 @@ class Renderer:
         row, col, _, at_o, _, target, _ = self._look_up(thing, mine, points, points.toward_eye)
         filtered = points.footprints[number]
         if filtered is not None:
-            return filtered.slices(at_o), target
+            return (filtered.slices(at_o), target) if filtered.linear_slices else None
         return self.sliced[number].slices(row, col, at_o), target
 
     def _add_light(self, light, points, slices, radiance):
@@ -188,7 +182,7 @@ class Renderer:
                 row, col, at_i, at_o, blend, target, _ = lookups
                 values = np.empty_like(at_i)
                 filtered = points.footprints[number]
-                if number in slices:
+                if slices.get(number) is not None:
                     sliced, belongs = slices[number]
                     sliced.shade(_of_points(belongs, mine, n), at_i, values)
                 elif filtered is not None:
@@ -375,9 +369,9 @@ class Points:
         self.share, self.point, self.start, self.normal = (np.empty((n, 3)) for _ in range(4))
         self.facing, self.depth = np.empty(n), np.empty(n)
         kernels.surface_points(
-            hits, prim, origins, directions, renderer.vertices, renderer.faces, renderer.normals,
-            renderer.clearance, renderer.smallest, self.share, self.point, self.start, self.normal, self.facing,
-            self.depth,
+            hits, prim, origins, directions,
+            renderer.vertices, renderer.faces, renderer.normals,
+            self.share, self.point, self.start, self.normal, self.facing, self.depth,
         )  # fmt: skip
         self.toward_eye = -directions[hits]
         self.thing = np.searchsorted(renderer.first_face, prim[hits], side="right") - 1

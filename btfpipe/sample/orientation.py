@@ -4,7 +4,8 @@ Row 0 is the top of the picture and the sample's t axis points up the picture, s
 """
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 
 @njit(cache=True, inline="always")

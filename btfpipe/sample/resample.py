@@ -1,8 +1,8 @@
 """A Sample or Model at the directions of another: its pictures interpolated as they are asked for."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.parallel import blocks
 from btfpipe.sample.appearance import Appearance
 from btfpipe.sample.shading import PairWeights

@@ -1,7 +1,8 @@
 """Pictures at another size: mean over the covered area when shrinking, linear when growing."""
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 
 class Resizer:

@@ -5,9 +5,10 @@ import math
 import os
 
 import numpy as np
-from numba import njit, prange, types
+from numba import prange, types
 from numba.extending import overload
 
+from btfpipe.compiled import njit
 from btfpipe.directions import Hemisphere
 from btfpipe.directions.interpolation import find
 from btfpipe.directions.pairs import NearestPairs

@@ -5,9 +5,9 @@ direction, whatever it meets there. Parallax and masking are in the pictures.
 """
 
 import numpy as np
-from numba import njit
 
 from btfpipe import hashing
+from btfpipe.compiled import njit
 from btfpipe.simulation.patch import texel_positions
 from btfpipe.simulation.reflectance import (
     average_fresnel,

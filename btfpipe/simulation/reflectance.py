@@ -7,7 +7,8 @@ Schlick 1994; the reflectance at grazing is min(1, 50 f0), so f0 = 0 is a plain 
 """
 
 import numpy as np
-from numba import njit
+
+from btfpipe.compiled import njit
 
 
 @njit(cache=True, inline="always")

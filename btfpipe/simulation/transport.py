@@ -6,9 +6,9 @@ full reflectance of the point that is seen, further ones diffusely, through a sp
 """
 
 import numpy as np
-from numba import njit
 
 from btfpipe import hashing, parallel
+from btfpipe.compiled import njit
 from btfpipe.simulation.reflectance import frame, lobes, reflect
 
 OFFSET = 2e-3  # texels by which rays start above the surface

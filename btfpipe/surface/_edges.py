@@ -6,14 +6,23 @@ or -1 on a boundary. ``leave[v]`` is a half-edge that leaves vertex v, the bound
 boundary, so that turning counter-clockwise from it meets every face of v. Dead faces have
 ``corner[3 f] = -1``, dead vertices ``leave[v] = -1``.
 
-``feature`` marks the half-edges of boundaries and creases; ``kind`` says whether a vertex moves freely (0), along its two
-feature edges (1), or not at all (2). All three edits keep the mesh a manifold of the same genus.
+``feature`` is 0, or 1 + the number of a feature edge of the input that the half-edge runs along; ``kind`` says whether a
+vertex moves freely (0), along its two feature edges (1), or not at all (2). ``place`` is a face of the input at or near a
+vertex, ``along`` a feature edge of the input at or near a vertex of kind 1, ``origin`` a face of the input at or near a face,
+on the same side of all feature lines: walks start there (`projection`). All three edits keep the mesh a manifold of the same
+genus.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from btfpipe.compiled import njit
 
 _DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
+_FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge
+_TURNED = 0.5  # cosine of the turn of a normal that makes a fold
+_STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
+_BESIDE = 0.4  # weight of a line's neighbours beside it, against 1 on it
 _RING = 96  # vertices of more neighbours than this are left alone
 
 
@@ -32,10 +41,10 @@ def _join(opposite, feature, h, g, mark):
     """Make h and g the two sides of one edge; either may be -1."""
     if h >= 0:
         opposite[h] = g
-        feature[h] = 1 if g < 0 else mark
+        feature[h] = mark
     if g >= 0:
         opposite[g] = h
-        feature[g] = 1 if h < 0 else mark
+        feature[g] = mark
 
 
 @njit(cache=True, nogil=True)
@@ -104,8 +113,83 @@ def _longest_beside(corner, opposite, points, h):
 
 
 @njit(cache=True, nogil=True)
-def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces, longest):
+def _area2(points, corner, h):
+    """The square of twice the area of the face at h."""
+    a, b, c = corner[h], corner[_next(h)], corner[_previous(h)]
+    x, y, z = _cross(
+        points[a, 0], points[a, 1], points[a, 2],
+        points[b, 0], points[b, 1], points[b, 2],
+        points[c, 0], points[c, 1], points[c, 2],
+    )  # fmt: skip
+    return x * x + y * y + z * z
+
+
+@njit(cache=True, nogil=True)
+def _split(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces, h, near,
+):  # fmt: skip
+    """Halve the edge at h; `near` says that feature lines are followed from its ends. Returns the new numbers."""
+    a, b = corner[h], corner[_next(h)]
+    g = opposite[h]
+    mark = feature[h]
+    m = n_vertices
+    n_vertices += 1
+    for axis in range(3):
+        points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
+        flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
+    kind[m] = 1 if mark else 0
+    along[m] = mark - 1
+    if mark and near:
+        # nearer than where the whole edge once was
+        along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
+    place[m] = origin[h // 3]
+    # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
+    f = 3 * n_faces
+    origin[n_faces] = origin[h // 3]
+    n_faces += 1
+    h1 = _next(h)
+    c = corner[_previous(h)]
+    outer, outer_mark = opposite[h1], feature[h1]
+    corner[h1] = m
+    corner[f], corner[f + 1], corner[f + 2] = m, b, c
+    _join(opposite, feature, f + 1, outer, outer_mark)
+    _join(opposite, feature, f + 2, h1, 0)
+    if g < 0:
+        _join(opposite, feature, f, -1, mark)
+        _join(opposite, feature, h, -1, mark)
+        leave[m] = f
+    else:
+        # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
+        e = 3 * n_faces
+        origin[n_faces] = origin[g // 3]
+        n_faces += 1
+        g1 = _next(g)
+        d = corner[_previous(g)]
+        outer, outer_mark = opposite[g1], feature[g1]
+        corner[g1] = m
+        corner[e], corner[e + 1], corner[e + 2] = m, a, d
+        _join(opposite, feature, e + 1, outer, outer_mark)
+        _join(opposite, feature, e + 2, g1, 0)
+        _join(opposite, feature, e, h, mark)
+        _join(opposite, feature, f, g, mark)
+        leave[m] = f
+        if g >= 0 and leave[a] == g1:
+            leave[a] = e + 1
+    if leave[b] == h1:
+        leave[b] = f + 1
+    return n_vertices, n_faces
+
+
+@njit(cache=True, nogil=True)
+def split_long(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces, longest, thin,
+):  # fmt: skip
     """Halve edges longer than `longest`, repeatedly, each when it is the longest of its faces.
+
+    With `thin` above 0, edges along features are halved whatever lies beside them, and others only between faces
+    that are higher than that.
 
     Stops early when the arrays are full. Returns the new numbers of vertices and faces and
     whether it finished.
@@ -121,57 +205,52 @@ def split_long(corner, opposite, feature, leave, kind, points, flat, n_vertices,
                 continue
             a, b = corner[h], corner[_next(h)]
             length = _length2(points, a, b)
-            if length <= limit or length < _longest_beside(corner, opposite, points, h):
+            if length <= limit:
+                continue
+            free = thin > 0.0 and feature[h] > 0
+            if not free and length < _longest_beside(corner, opposite, points, h):
                 continue
             if n_vertices + 1 > len(points) or 3 * (n_faces + 2) > len(corner):
                 return n_vertices, n_faces, False
+            if feature[h] == 0 and thin > 0.0:
+                low = min(_area2(points, corner, h), _area2(points, corner, opposite[h]))
+                if low < thin * thin * length:
+                    continue
             changed = True
-            g = opposite[h]
-            mark = feature[h]
-            m = n_vertices
-            n_vertices += 1
-            for axis in range(3):
-                points[m, axis] = 0.5 * (points[a, axis] + points[b, axis])
-                flat[m, axis] = 0.5 * (flat[a, axis] + flat[b, axis])
-            kind[m] = 1 if mark else 0
-            # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
-            f = 3 * n_faces
-            n_faces += 1
-            h1 = _next(h)
-            c = corner[_previous(h)]
-            outer, outer_mark = opposite[h1], feature[h1]
-            corner[h1] = m
-            corner[f], corner[f + 1], corner[f + 2] = m, b, c
-            _join(opposite, feature, f + 1, outer, outer_mark)
-            _join(opposite, feature, f + 2, h1, 0)
-            if g < 0:
-                _join(opposite, feature, f, -1, 1)
-                _join(opposite, feature, h, -1, 1)
-                leave[m] = f
-            else:
-                # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
-                e = 3 * n_faces
-                n_faces += 1
-                g1 = _next(g)
-                d = corner[_previous(g)]
-                outer, outer_mark = opposite[g1], feature[g1]
-                corner[g1] = m
-                corner[e], corner[e + 1], corner[e + 2] = m, a, d
-                _join(opposite, feature, e + 1, outer, outer_mark)
-                _join(opposite, feature, e + 2, g1, 0)
-                _join(opposite, feature, e, h, mark)
-                _join(opposite, feature, f, g, mark)
-                leave[m] = f
-                if g >= 0 and leave[a] == g1:
-                    leave[a] = e + 1
-            if leave[b] == h1:
-                leave[b] = f + 1
+            n_vertices, n_faces = _split(
+                corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+                n_vertices, n_faces, h, thin == 0.0,
+            )  # fmt: skip
     return n_vertices, n_faces, True
 
 
 @njit(cache=True, nogil=True)
-def _folds(corner, points, out, n, skip1, skip2, x, y, z):
-    """Whether moving the vertex that the half-edges `out` leave to (x, y, z) turns a face over."""
+def insert_vertex(corner, opposite, feature, leave, origin, face, m, n_faces):
+    """Cut a face into three around the new vertex m; two faces go behind the last. Returns the number of faces."""
+    h, e, g = 3 * face, 3 * n_faces, 3 * n_faces + 3
+    a, b, c = corner[h], corner[h + 1], corner[h + 2]
+    beyond_b, mark_b = opposite[h + 1], feature[h + 1]
+    beyond_c, mark_c = opposite[h + 2], feature[h + 2]
+    corner[h + 2] = m
+    corner[e], corner[e + 1], corner[e + 2] = b, c, m
+    corner[g], corner[g + 1], corner[g + 2] = c, a, m
+    origin[n_faces] = origin[n_faces + 1] = origin[face]
+    _join(opposite, feature, e, beyond_b, mark_b)
+    _join(opposite, feature, g, beyond_c, mark_c)
+    _join(opposite, feature, h + 1, e + 2, 0)
+    _join(opposite, feature, e + 1, g + 2, 0)
+    _join(opposite, feature, g + 1, h + 2, 0)
+    leave[m] = h + 2
+    if leave[b] == h + 1:
+        leave[b] = e
+    if leave[c] == h + 2:
+        leave[c] = g
+    return n_faces + 2
+
+
+@njit(cache=True, nogil=True)
+def _folds(corner, points, out, n, skip1, skip2, x, y, z, least):
+    """Whether moving the vertex that the half-edges `out` leave to (x, y, z) turns a face's normal so that the cosine is below `least`."""
     for i in range(n):
         h = out[i]
         if h // 3 == skip1 or h // 3 == skip2:
@@ -189,17 +268,99 @@ def _folds(corner, points, out, n, skip1, skip2, x, y, z):
         )  # fmt: skip
         old = np.sqrt(ox * ox + oy * oy + oz * oz)
         new = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if ox * nx + oy * ny + oz * nz < 0.2 * old * new:
+        if ox * nx + oy * ny + oz * nz < least * old * new:
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
+def _collapse(
+    corner, opposite, feature, leave, kind, points, flat, h, bound, least,
+    out_a, out_b, near_a, near_b,
+):  # fmt: skip
+    """Collapse the edge at h, from its start to its end, if nothing folds, tears or gets too long; returns whether."""
+    g = opposite[h]
+    a, b = corner[h], corner[_next(h)]
+    if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
+        return False
+    h1, h2 = _next(h), _previous(h)
+    if kind[a] == 1 and feature[h2]:
+        return False
+    boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
+    if boundary_a and boundary_b and g >= 0:
+        return False
+    faces_a, n_a = _ring(corner, opposite, leave, a, out_a, near_a)
+    faces_b, n_b = _ring(corner, opposite, leave, b, out_b, near_b)
+    if n_a < 0 or n_b < 0:
+        return False
+    common = 0
+    for i in range(n_a):
+        for j in range(n_b):
+            common += near_a[i] == near_b[j]
+    if common != (1 if g < 0 else 2):
+        return False
+    outer1, outer2 = opposite[h1], opposite[h2]
+    if outer1 < 0 and outer2 < 0:
+        return False
+    if not _may_lose(corner, opposite, leave, corner[h2]):
+        return False
+    inner1, inner2 = -1, -1
+    if g >= 0:
+        g1, g2 = _next(g), _previous(g)
+        inner1, inner2 = opposite[g1], opposite[g2]
+        if inner1 < 0 and inner2 < 0:
+            return False
+        if kind[a] == 1 and feature[g1]:
+            return False
+        if not _may_lose(corner, opposite, leave, corner[g2]):
+            return False
+    both = kind[a] == 0 and kind[b] == 0
+    share = 0.5 if both else 0.0
+    x = points[b, 0] + share * (points[a, 0] - points[b, 0])
+    y = points[b, 1] + share * (points[a, 1] - points[b, 1])
+    z = points[b, 2] + share * (points[a, 2] - points[b, 2])
+    stretched = False
+    for i in range(n_a + n_b if both else n_a):
+        v = near_a[i] if i < n_a else near_b[i - n_a]
+        now = (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (points[v, 2] - z) ** 2
+        if now > bound and now > _STRETCH * _length2(points, v, a if i < n_a else b):
+            stretched = True
+            break
+    f0 = h // 3
+    f1 = g // 3 if g >= 0 else -1
+    if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z, least):
+        return False
+    if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z, least):
+        return False
+    points[b, 0], points[b, 1], points[b, 2] = x, y, z
+    for axis in range(3):
+        flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
+    c = corner[h2]
+    d = corner[_previous(g)] if g >= 0 else -1
+    mark = max(feature[h1], feature[h2])
+    inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
+    for i in range(faces_a):
+        corner[out_a[i]] = b
+    corner[3 * f0] = -1
+    _join(opposite, feature, outer1, outer2, mark)
+    if g >= 0:
+        corner[3 * f1] = -1
+        _join(opposite, feature, inner1, inner2, inner_mark)
+    leave[a] = -1
+    _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
+    _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
+    if g >= 0:
+        _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
+    return True
+
+
+@njit(cache=True, nogil=True)
 def collapse_short(
-    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest
+    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest, least
 ):
     """Collapse edges shorter than `shortest` where nothing folds, tears or gets longer than `longest`.
 
+    A fold is a normal that turns so that its cosine is below `least`.
     Returns the number of collapses. Features are shortened only along themselves, and a component
     or a hole never vanishes (link condition).
     """
@@ -210,88 +371,46 @@ def collapse_short(
     for start in range(3 * n_faces):
         if corner[start - start % 3] < 0 or opposite[start] > start:
             continue
+        if _length2(points, corner[start], corner[_next(start)]) >= limit:
+            continue
         for side in range(2):
-            h, g = start, opposite[start]
-            if side == 1:
-                if g < 0:
-                    break
-                h, g = g, h
-            a, b = corner[h], corner[_next(h)]
-            if _length2(points, a, b) >= limit:
+            h = start if side == 0 else opposite[start]
+            if h >= 0 and _collapse(
+                corner, opposite, feature, leave, kind, points, flat, h, bound, least,
+                out_a, out_b, near_a, near_b,
+            ):  # fmt: skip
+                done += 1
                 break
-            if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
-                continue
-            h1, h2 = _next(h), _previous(h)
-            if kind[a] == 1 and feature[h2]:
-                continue
-            boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
-            if boundary_a and boundary_b and g >= 0:
-                continue
-            faces_a, n_a = _ring(corner, opposite, leave, a, out_a, near_a)
-            faces_b, n_b = _ring(corner, opposite, leave, b, out_b, near_b)
-            if n_a < 0 or n_b < 0:
-                continue
-            common = 0
-            for i in range(n_a):
-                for j in range(n_b):
-                    common += near_a[i] == near_b[j]
-            if common != (1 if g < 0 else 2):
-                continue
-            outer1, outer2 = opposite[h1], opposite[h2]
-            if outer1 < 0 and outer2 < 0:
-                continue
-            if not _may_lose(corner, opposite, leave, corner[h2]):
-                continue
-            inner1, inner2 = -1, -1
-            if g >= 0:
-                g1, g2 = _next(g), _previous(g)
-                inner1, inner2 = opposite[g1], opposite[g2]
-                if inner1 < 0 and inner2 < 0:
-                    continue
-                if kind[a] == 1 and feature[g1]:
-                    continue
-                if not _may_lose(corner, opposite, leave, corner[g2]):
-                    continue
-            both = kind[a] == 0 and kind[b] == 0
-            share = 0.5 if both else 0.0
-            x = points[b, 0] + share * (points[a, 0] - points[b, 0])
-            y = points[b, 1] + share * (points[a, 1] - points[b, 1])
-            z = points[b, 2] + share * (points[a, 2] - points[b, 2])
-            stretched = False
-            for i in range(n_a + n_b if both else n_a):
-                v = near_a[i] if i < n_a else near_b[i - n_a]
-                if (points[v, 0] - x) ** 2 + (points[v, 1] - y) ** 2 + (
-                    points[v, 2] - z
-                ) ** 2 > bound:
-                    stretched = True
+    return done
+
+
+@njit(cache=True, nogil=True)
+def collapse_of(corner, opposite, feature, leave, kind, points, flat, chosen):
+    """Collapse the shortest edge that may go of each face of `chosen`, whatever folds; returns how many did."""
+    out_a, out_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    near_a, near_b = np.empty(_RING, np.int64), np.empty(_RING, np.int64)
+    done = 0
+    for f in chosen:
+        tried = np.zeros(3, np.uint8)
+        for _ in range(3):
+            k, least = -1, np.inf
+            for i in range(3):
+                if corner[3 * f] >= 0 and tried[i] == 0:
+                    length = _length2(points, corner[3 * f + i], corner[_next(3 * f + i)])
+                    if length < least:
+                        k, least = i, length
+            if k < 0:
+                break
+            tried[k] = 1
+            for side in range(2):
+                h = 3 * f + k if side == 0 else opposite[3 * f + k]
+                if h >= 0 and _collapse(
+                    corner, opposite, feature, leave, kind, points, flat, h, np.inf, -2.0,
+                    out_a, out_b, near_a, near_b,
+                ):  # fmt: skip
+                    done += 1
+                    tried[:] = 1
                     break
-            f0 = h // 3
-            f1 = g // 3 if g >= 0 else -1
-            if stretched or _folds(corner, points, out_a, faces_a, f0, f1, x, y, z):
-                continue
-            if both and _folds(corner, points, out_b, faces_b, f0, f1, x, y, z):
-                continue
-            points[b, 0], points[b, 1], points[b, 2] = x, y, z
-            for axis in range(3):
-                flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
-            c = corner[h2]
-            d = corner[_previous(g)] if g >= 0 else -1
-            mark = feature[h1] | feature[h2]
-            inner_mark = feature[_next(g)] | feature[_previous(g)] if g >= 0 else 0
-            for i in range(faces_a):
-                corner[out_a[i]] = b
-            corner[3 * f0] = -1
-            _join(opposite, feature, outer1, outer2, mark)
-            if g >= 0:
-                corner[3 * f1] = -1
-                _join(opposite, feature, inner1, inner2, inner_mark)
-            leave[a] = -1
-            _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
-            _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
-            if g >= 0:
-                _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
-            done += 1
-            break
     return done
 
 
@@ -363,6 +482,9 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
             ux * ux + uy * uy + uz * uz
         ) or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz):
             continue
+        bent = _cosine(px, py, pz, qx, qy, qz)
+        if bent < _FLAT and _cosine(ux, uy, uz, vx, vy, vz) < bent:
+            continue
         o_bc, m_bc = opposite[h1], feature[h1]
         o_ca, m_ca = opposite[h2], feature[h2]
         o_ad, m_ad = opposite[g1], feature[g1]
@@ -385,6 +507,75 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         excess[d] += 1
         done += 1
     return done
+
+
+@njit(cache=True, nogil=True)
+def name_origins(corner, n_faces, kind, place, origin):
+    """Set the origin of each face to the place of one of its free vertices, if it has one."""
+    for f in range(n_faces):
+        for k in range(3):
+            v = corner[3 * f + k]
+            if kind[v] == 0:
+                origin[f] = place[v]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cosine(px, py, pz, qx, qy, qz):
+    """Cosine of the angle between two vectors, 1 if one is zero."""
+    size = np.sqrt((px * px + py * py + pz * pz) * (qx * qx + qy * qy + qz * qz))
+    return (px * qx + py * qy + pz * qz) / size if size > 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def folded(corner, n_faces, points, place, moved, moved_place, normals, keep):
+    """Mark the vertices of faces that a move of all vertices turns over; returns whether there are any.
+
+    A face is turned over if its normal turns by more than 60 degrees and then agrees less than
+    before with the normals of the input where its corners lie.
+
+    Parameters
+    ----------
+    corner : (3 m,) int32
+    n_faces : int
+    points, moved : (n, 3) float64
+        Before and after the move.
+    place, moved_place : (n,) int32
+        Faces of the input, before and after.
+    normals : (faces of the input, 3) float64
+    keep : (n,) uint8
+        Set to 1 for what should stay.
+    """
+    found = False
+    for f in range(n_faces):
+        a, b, c = corner[3 * f], corner[3 * f + 1], corner[3 * f + 2]
+        ox, oy, oz = _cross(
+            points[a, 0], points[a, 1], points[a, 2],
+            points[b, 0], points[b, 1], points[b, 2],
+            points[c, 0], points[c, 1], points[c, 2],
+        )  # fmt: skip
+        nx, ny, nz = _cross(
+            moved[a, 0], moved[a, 1], moved[a, 2],
+            moved[b, 0], moved[b, 1], moved[b, 2],
+            moved[c, 0], moved[c, 1], moved[c, 2],
+        )  # fmt: skip
+        if _cosine(ox, oy, oz, nx, ny, nz) >= _TURNED:
+            continue
+        before = _agreement(normals, place[a], place[b], place[c], ox, oy, oz)
+        if _agreement(normals, moved_place[a], moved_place[b], moved_place[c], nx, ny, nz) < before:
+            found = True
+            keep[a] = keep[b] = keep[c] = 1
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _agreement(normals, i, j, k, x, y, z):
+    """Cosine of the angle between a vector and the sum of three normals."""
+    return _cosine(
+        normals[i, 0] + normals[j, 0] + normals[k, 0],
+        normals[i, 1] + normals[j, 1] + normals[k, 1],
+        normals[i, 2] + normals[j, 2] + normals[k, 2],
+        x, y, z,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -425,7 +616,8 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
     """Fill `step` with each vertex's move towards the middle of its neighbours, within the tangent plane.
 
     Neighbours are weighted by the areas around the edge to them, so that crowded vertices spread.
-    Vertices of kind 1 move towards the middle of their two feature neighbours, those of kind 2 stay.
+    Vertices of kind 1 move along their line, towards the middle of its two neighbours and a little towards that
+    of all others, so that vertices on lines close to each other interleave. Those of kind 2 stay.
     """
     for v in prange(n_vertices):
         step[v, 0] = step[v, 1] = step[v, 2] = 0.0
@@ -434,14 +626,20 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             continue
         x, y, z = points[v, 0], points[v, 1], points[v, 2]
         nx = ny = nz = cx = cy = cz = total = 0.0
+        # of a line: where it goes on either way
+        fx = fy = fz = gx = gy = gz = 0.0
         while True:
             b, c = corner[_next(h)], corner[_previous(h)]
             if kind[v] == 1:
+                weight = _BESIDE
                 if feature[h]:
-                    cx += points[b, 0]
-                    cy += points[b, 1]
-                    cz += points[b, 2]
-                    total += 1.0
+                    weight = 1.0
+                    gx, gy, gz = fx, fy, fz
+                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
+                cx += weight * points[b, 0]
+                cy += weight * points[b, 1]
+                cz += weight * points[b, 2]
+                total += weight
             else:
                 ex, ey, ez = _cross(
                     x, y, z,
@@ -461,6 +659,8 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             if h < 0:
                 if kind[v] == 1:
                     b = corner[p]
+                    gx, gy, gz = fx, fy, fz
+                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
                     cx += points[b, 0]
                     cy += points[b, 1]
                     cz += points[b, 2]
@@ -476,11 +676,19 @@ def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
             if n2 > 0.0:
                 k = (dx * nx + dy * ny + dz * nz) / n2
                 dx, dy, dz = dx - k * nx, dy - k * ny, dz - k * nz
+        else:
+            fx, fy, fz = fx - gx, fy - gy, fz - gz
+            f2 = fx * fx + fy * fy + fz * fz
+            k = (dx * fx + dy * fy + dz * fz) / f2 if f2 > 0.0 else 0.0
+            dx, dy, dz = k * fx, k * fy, k * fz
         step[v, 0], step[v, 1], step[v, 2] = _DAMPING * dx, _DAMPING * dy, _DAMPING * dz
 
 
 @njit(cache=True, nogil=True)
-def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_faces):
+def compact(
+    corner, opposite, feature, leave, kind, place, along, origin, points, flat,
+    n_vertices, n_faces,
+):  # fmt: skip
     """Move the living to the front, in order; returns their numbers."""
     renamed = np.empty(n_vertices, np.int64)
     n = 0
@@ -488,6 +696,7 @@ def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_
         renamed[v] = n
         if leave[v] >= 0:
             leave[n], kind[n] = leave[v], kind[v]
+            place[n], along[n] = place[v], along[v]
             for axis in range(3):
                 points[n, axis] = points[v, axis]
                 flat[n, axis] = flat[v, axis]
@@ -500,6 +709,7 @@ def compact(corner, opposite, feature, leave, kind, points, flat, n_vertices, n_
     for f in range(n_faces):
         if corner[3 * f] < 0:
             continue
+        origin[moved[f]] = origin[f]
         for k in range(3):
             h, g = 3 * f + k, 3 * moved[f] + k
             corner[g] = renamed[corner[h]]

@@ -9,8 +9,8 @@ import math
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError
 from btfpipe.sample.orientation import step_to_texels
 

@@ -1,6 +1,7 @@
 """From a raw mesh to a Surface: clean, resample, give frames, stack levels."""
 
 import itertools
+import math
 import os
 
 import numpy as np
@@ -8,13 +9,24 @@ import numpy as np
 from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
+from btfpipe.surface.curl import curl_facts
+from btfpipe.surface.deviation import (
+    MOST_SPACINGS,
+    MOST_SPACINGS_AT_TIPS,
+    farthest_beyond,
+    measure,
+    most_area_error,
+    sharp_tips,
+)
 from btfpipe.surface.pyramid import parents
 from btfpipe.surface.remeshing import resample
 from btfpipe.surface.smooth_input import PHONG_ALPHA, smooth_input
 from btfpipe.surface.surface import Level, Surface
-from btfpipe.surface.topology import describe, edges
+from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 _TOLERANCE = 0.05
+_MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
+_MOST_TRIED = 1_000_000
 _FIELD_ROUNDS = 10
 _FEWEST = 20  # vertices of the coarsest level
 # measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
@@ -73,8 +85,9 @@ def prepare(
     Raises
     ------
     InputError
-        See `clean`; also if the finest level cannot have `n_vertices` within 5 %, if the coarsest would have
-        hardly any, or if `memory` does not suffice.
+        See `clean`; also if the finest level cannot have `n_vertices` within 5 %, if it would, without smoothing,
+        lie farther from the input than `deviation` allows, or have another area; if the coarsest would have
+        hardly any vertices, or if `memory` does not suffice.
     """
     _check_levels(name, n_vertices, n_levels)
     if memory is not None:
@@ -84,15 +97,21 @@ def prepare(
     vertices, faces, repairs = clean(vertices, faces, name)
     source = smooth_input(vertices, faces, crease_deg, PHONG_ALPHA if smooth else 0.0)
     euler, loops, _ = describe(faces, len(vertices))
-    levels = []
+    levels, level_distances = [], []
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
         with naming(name):
-            fine, place, weights = resample(
+            made = resample(
                 source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
             )
+        fine, place, weights = made
+        off = made.deviation
         if i == 0:
-            _check_count(name, len(place), wanted, len(euler))
+            problem = _problem(source, made, wanted)
+            if problem:
+                raise InputError(_refusal(name, source, wanted, problem, _most_vertices(memory)))
+            deviation = off
+        level_distances.append(float(off.distances.max() / made.spacing))
         normals = source.normals(place, weights)
         levels.append(
             Level(
@@ -100,6 +119,9 @@ def prepare(
                 normals.astype(np.float32), np.zeros_like(normals, np.float32),
             )
         )  # fmt: skip
+        if i == 0 and smooth:
+            moved = np.linalg.norm(levels[0].vertices - source.flat(place, weights), axis=1)
+            deviation = measure(levels[0].vertices, fine, vertices, faces, made.spacing)
     fallbacks = []
     for level, coarser in itertools.pairwise(levels):
         level.parent_face, level.parent_weights, missed = parents(
@@ -111,14 +133,20 @@ def prepare(
         _lay_field(levels, strokes, turn)
     finest = levels[0]
     index = field.singularities(finest.faces, finest.normals, finest.tangents)
-    pair = edges(finest.faces)
-    lengths = np.linalg.norm(finest.vertices[pair[:, 0]] - finest.vertices[pair[:, 1]], axis=1)
+    lengths = edge_lengths(finest.vertices, finest.faces)
+    extent = float(np.ptp(vertices, axis=0).max())
     genus = (2 - loops - euler) // 2
     facts = {
         "vertices": len(finest.vertices),
         "faces": len(finest.faces),
         "level_vertices": [len(level.vertices) for level in levels],
-        "area": float(_area(finest.vertices, finest.faces)),
+        "area": mesh_area(finest.vertices, finest.faces),
+        "area_ratio": deviation.area_ratio,
+        "distance": deviation.summary(float(lengths.mean()), extent),
+        "smoothing_moved": {"max": float(moved.max()), "mean": float(moved.mean())}
+        if smooth
+        else None,
+        "level_distances_spacings": level_distances,
         "spacing": float(lengths.mean()),
         "spacing_variation": float(lengths.std() / lengths.mean()),
         "components": len(euler),
@@ -126,6 +154,7 @@ def prepare(
         "boundaries": int(loops.sum()),
         "singularities": int((index != 0).sum()),
         "index_sum": int(index.sum()),
+        **curl_facts(finest),
         "euler_characteristic": int(euler.sum()),
         "repairs": sum(repairs.values()),
         "repaired": {key: count for key, count in repairs.items() if count},
@@ -145,6 +174,13 @@ def _check_levels(name, n_vertices, n_levels):
         )
 
 
+def _most_vertices(memory):
+    """How many vertices are tried when those asked for do not suffice."""
+    if memory is None:
+        return _MOST_TRIED
+    return min(_MOST_TRIED, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
+
+
 def _check_memory(name, n_vertices, memory):
     need = _PROCESS_BYTES + _BYTES_A_VERTEX * n_vertices
     if need > memory:
@@ -155,12 +191,46 @@ def _check_memory(name, n_vertices, memory):
         )
 
 
-def _check_count(name, found, wanted, n_components):
+def _problem(source, made, wanted):
+    """What a resampling without smoothing does wrong, as words, and how many times too wrong; nothing if nothing is."""
+    spacing, deviation = made.spacing, made.deviation
+    found = len(made.place_face)
     if abs(found - wanted) > _TOLERANCE * wanted:
-        raise InputError(
-            f"{name}: {wanted} vertices asked for, {found} is as near as its {n_components} components and its"
-            f" boundaries allow. Ask for {found} or more with --vertices."
-        )
+        return (
+            f"{found} is as near as its edges, boundaries and components allow"
+            f" ({len(describe(source.faces, len(source.vertices))[0])} components)"
+        ), found / wanted
+    beyond = farthest_beyond(deviation, spacing, sharp_tips(source.vertices, source.faces, spacing))
+    if beyond:
+        where = ", ".join(f"{x:.4g}" for x in beyond[1])
+        return (
+            f"they would lie {beyond[0] / spacing:.2f} spacings from it, at ({where}), and at most"
+            f" {MOST_SPACINGS:g} are allowed ({MOST_SPACINGS_AT_TIPS:g} at tips)"
+        ), 1.0
+    error, most = abs(deviation.area_ratio - 1), most_area_error(wanted)
+    if error > most:
+        return (
+            f"its area would change by {100 * error:.1f} %, and at most {100 * most:.1f} % are allowed:"
+            " detail finer than their spacing is lost"
+        ), error / most
+    return None
+
+
+def _refusal(name, source, wanted, problem, most):
+    """The sentence that says what is wrong and how many vertices do, of at most `most`: that many are tried."""
+    said, excess = problem
+    start = f"{name}: {wanted} vertices asked for are too few for its shape: {said}."
+    n = wanted
+    while n < most:
+        n = min(math.ceil(n * min(max(excess, _MORE_VERTICES), _MOST_MORE) / 100) * 100, most)
+        problem = _problem(source, resample(source, n), n)
+        if not problem:
+            return f"{start} Ask for {n} with --vertices."
+        excess = problem[1]
+    return (
+        f"{start} Up to {n} were tried, and do not suffice. Leave out what is too fine to show, for example"
+        " with MeshLab's filter `Simplification: Quadric Edge Collapse Decimation`."
+    )
 
 
 def _lay_field(levels, strokes, turn):
@@ -181,13 +251,3 @@ def _lay_field(levels, strokes, turn):
         tangents = field.unit_field(vectors, level.faces, level.normals, _FIELD_ROUNDS)
         normals = np.asarray(level.normals, np.float64)
         level.tangents = field.turned(tangents, normals, turn).astype(np.float32)
-
-
-def _area(vertices, faces):
-    corners = vertices[faces]
-    return (
-        0.5
-        * np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        ).sum()
-    )

@@ -7,6 +7,8 @@ import numpy as np
 from btfpipe.surface.topology import edge_normals_angle, half_edges, opposite_half_edges
 
 PHONG_ALPHA = 0.75
+# angles between faces up to which their vertices are rounded off in full, and from which on not at all
+_ROUND_DEG, _FLAT_DEG = 45, 75
 
 
 @dataclass
@@ -20,14 +22,13 @@ class SmoothInput:
     corner_normals : (m, 3, 3) float64
         Unit normals per face corner: the angle-weighted mean over the faces around the vertex that are
         not cut off by creases.
-    features : (e, 2) int64
-        Edges that a resampling must keep: boundaries, then creases.
-    feature_face : (e,) int64
-        A face that holds each of them.
-    kind : (n,) uint8
-        0 inside, 1 on a feature, 2 at an end, a branching or a corner of features.
+    opposite : (3 m,) int32
+        See `topology.opposite_half_edges`.
+    crease : (3 m,) bool
+        Half-edges across which normals are not averaged.
     ease : (n,) float64
-        1 where the smooth surface may leave the faces, 0 at crease vertices.
+        1 where the smooth surface may leave the faces, 0 at vertices of creases and of sharp edges, which are
+        corners rather than coarse pieces of something round.
     alpha : float
         Strength of the Phong tessellation, 0 for the flat faces.
     """
@@ -35,45 +36,14 @@ class SmoothInput:
     vertices: np.ndarray
     faces: np.ndarray
     corner_normals: np.ndarray
-    features: np.ndarray
-    feature_face: np.ndarray
-    kind: np.ndarray
+    opposite: np.ndarray
+    crease: np.ndarray
     ease: np.ndarray
     alpha: float
 
-    def closest(self, points):
-        """Face and barycentric coordinates of the closest places on the flat faces.
-
-        Parameters
-        ----------
-        points : (k, 3) float64
-
-        Returns
-        -------
-        face : (k,) int64
-        weights : (k, 3) float64
-        nearest : (k, 3) float64
-        """
-        import igl
-
-        points = np.ascontiguousarray(points)
-        _, face, nearest = igl.point_mesh_squared_distance(
-            points, self.vertices, self.faces.astype(np.int64)
-        )
-        return face, self.weights(face, nearest), nearest
-
-    def closest_on_features(self, points):
-        """As `closest`, on the feature edges."""
-        import igl
-
-        points = np.ascontiguousarray(points)
-        _, edge, nearest = igl.point_mesh_squared_distance(points, self.vertices, self.features)
-        face = self.feature_face[edge]
-        return face, self.weights(face, nearest), nearest
-
-    def weights(self, face, points):
-        """Barycentric coordinates, (k, 3), of `points` on the given faces."""
-        return barycentric(points, self.vertices[self.faces[face]])
+    def flat(self, face, weights):
+        """Positions on the faces themselves, (k, 3) float64."""
+        return np.einsum("kc,kcx->kx", weights, self.vertices[self.faces[face]])
 
     def lift(self, face, weights):
         """Positions on the smooth surface, (k, 3) float64 (Boubekeur and Alexa 2008, eq. 3).
@@ -81,10 +51,10 @@ class SmoothInput:
         The point is pulled towards the mean of its projections onto the tangent planes of its face's
         corners. Unlike there the pull fades towards creases, where the two sides would part.
         """
-        corners = self.vertices[self.faces[face]]
-        flat = np.einsum("kc,kcx->kx", weights, corners)
+        flat = self.flat(face, weights)
         if self.alpha == 0:
             return flat
+        corners = self.vertices[self.faces[face]]
         normals = self.corner_normals[face]
         above = np.einsum("kcx,kcx->kc", flat[:, None] - corners, normals)
         pull = np.einsum("kc,kc,kcx->kx", weights, above, normals)
@@ -151,22 +121,17 @@ def smooth_input(vertices, faces, crease_deg=None, alpha=PHONG_ALPHA):
         Strength of the Phong tessellation.
     """
     opposite = opposite_half_edges(faces)
-    start, end = half_edges(faces)
-    boundary = opposite < 0
+    angle = np.rad2deg(edge_normals_angle(vertices, faces, opposite))
     crease = np.zeros(len(opposite), bool)
     if crease_deg is not None:
-        crease = ~boundary & (
-            edge_normals_angle(vertices, faces, opposite) > np.deg2rad(crease_deg)
-        )
+        crease = (opposite >= 0) & (angle > crease_deg)
     normals = _corner_normals(vertices, faces, opposite, crease)
-    keep = np.flatnonzero(boundary | (crease & (np.arange(len(opposite)) > opposite)))
-    features = np.stack([start[keep], end[keep]], axis=1).astype(np.int64)
-    ease = np.ones(len(vertices))
-    ease[start[crease]] = 0
-    return SmoothInput(
-        vertices, faces, normals, features, keep // 3,
-        _kinds(vertices, features), ease, alpha,
-    )  # fmt: skip
+    sharpest = np.zeros(len(vertices))
+    start, end = half_edges(faces)
+    np.maximum.at(sharpest, np.r_[start, end], np.r_[angle, angle])
+    ease = np.clip((_FLAT_DEG - sharpest) / (_FLAT_DEG - _ROUND_DEG), 0, 1)
+    ease[start[crease]] = ease[end[crease]] = 0
+    return SmoothInput(vertices, faces, normals, opposite, crease, ease, alpha)
 
 
 def _corner_normals(vertices, faces, opposite, crease):
@@ -198,20 +163,3 @@ def _corner_normals(vertices, faces, opposite, crease):
     fallback[np.linalg.norm(fallback, axis=1) == 0] = (0, 0, 1)
     mean = np.where(size > 1e-9, summed / np.maximum(size, 1e-9), fallback)
     return mean[group].reshape(len(faces), 3, 3)
-
-
-def _kinds(vertices, features):
-    """Vertices on features (1) and their ends, branchings and turns over 45 degrees (2)."""
-    n = len(vertices)
-    kind = np.zeros(n, np.uint8)
-    degree = np.bincount(features.ravel(), minlength=n)
-    direction = vertices[features[:, 1]] - vertices[features[:, 0]]
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-300)
-    away = np.zeros((n, 3))
-    np.add.at(away, features[:, 0], direction)
-    np.add.at(away, features[:, 1], -direction)
-    kind[degree > 0] = 1
-    # two unit vectors that leave a straight vertex cancel; at a turn of 45 degrees their sum is 2 sin(22.5 deg) long
-    corner = np.linalg.norm(away, axis=1) > 2 * np.sin(np.pi / 8)
-    kind[(degree > 0) & ((degree != 2) | corner)] = 2
-    return kind

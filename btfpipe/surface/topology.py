@@ -36,6 +36,17 @@ def edges(faces):
     return np.stack([keys // base, keys % base], axis=1)
 
 
+def edge_lengths(vertices, faces):
+    """Length of each undirected edge, (e,) float64, in the order of `edges`."""
+    a, b = edges(faces).T
+    return np.linalg.norm(vertices[a] - vertices[b], axis=1)
+
+
+def mean_edge(vertices, faces):
+    """Mean length of the undirected edges: the spacing of an even mesh."""
+    return float(edge_lengths(vertices, faces).mean())
+
+
 def edge_normals_angle(vertices, faces, opposite):
     """Angle between the normals of the two faces at each half-edge, (3 m,) float64; 0 on a boundary."""
     corners = vertices[faces]
@@ -46,6 +57,21 @@ def edge_normals_angle(vertices, faces, opposite):
         np.linalg.norm(np.cross(here, there), axis=1), np.einsum("hx,hx->h", here, there)
     )
     return np.where(opposite < 0, 0.0, angle)
+
+
+def face_normals(vertices, faces):
+    """Unit normals of the faces, (m, 3) float64; 0 where a face has no area."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return np.divide(across, length, out=np.zeros_like(across), where=length > 0)
+
+
+def mesh_area(vertices, faces):
+    """Area of all faces together."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(0.5 * np.linalg.norm(across, axis=1).sum())
 
 
 def face_components(faces, n_vertices):

@@ -1,8 +1,8 @@
 """How much of a coordinate map is made of whole pieces of the sample."""
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.sample.orientation import step_to_texels
 from btfpipe.surface.flatten import turned
 

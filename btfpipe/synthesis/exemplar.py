@@ -3,9 +3,9 @@
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
 from btfpipe.analysis.neighbours import bounding_box, coarse_texel, usable_texels
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError, amount
 from btfpipe.hashing import uniform
 from btfpipe.parallel import single_threaded_blas

@@ -11,8 +11,8 @@ import time
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
+from btfpipe.compiled import njit
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks, ordered_map
 from btfpipe.sample.orientation import step_to_texels

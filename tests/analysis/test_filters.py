@@ -21,6 +21,59 @@ def test_bank_has_the_kernels_of_leung_and_malik():
     assert np.allclose(second[:, ::-1, ::-1], second)
 
 
+def test_kernels_are_derivatives_of_their_gaussians():
+    """Found by finite differences of the Gaussian itself, in the bank's order, signs included."""
+    sigma, step = 1.2, 1e-3
+    kernels = leung_malik(sigma)
+    half = kernels.shape[1] // 2
+    row, col = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
+
+    def bell(row, col, across, along, angle):
+        u = col * np.cos(angle) + row * np.sin(angle)
+        v = row * np.cos(angle) - col * np.sin(angle)
+        return np.exp(-((u / across) ** 2) / 2 - (v / along) ** 2 / 2)
+
+    def shifted(n, angle, *widths):
+        return bell(row + n * step * np.sin(angle), col + n * step * np.cos(angle), *widths)
+
+    expected = []
+    widths = sigma * np.sqrt(2) ** np.arange(4)
+    angles = np.arange(6) * np.pi / 6
+    long = [(w, 3 * w, angle) for w in widths[:3] for angle in angles]
+    for w, v, angle in long:
+        first = shifted(1, angle, w, v, angle) - shifted(-1, angle, w, v, angle)
+        expected.append((first, v))
+    for w, v, angle in long:
+        middle = 2 * shifted(0, angle, w, v, angle)
+        second = shifted(1, angle, w, v, angle) + shifted(-1, angle, w, v, angle) - middle
+        expected.append((second, v))
+    for w in [*widths, *(3 * widths)]:
+        laplacian = -4 * shifted(0, 0, w, w, 0)
+        for turn in range(4):
+            laplacian += shifted(1, turn * np.pi / 2, w, w, 0)
+        expected.append((laplacian, w))
+    expected += [(shifted(0, 0, w, w, 0), None) for w in widths]
+    for kernel, (derivative, reach) in zip(kernels, expected, strict=True):
+        if reach is None:
+            reach = np.inf
+            derivative = derivative * (kernel > 0)
+        else:
+            inside = (np.abs(row) <= np.ceil(3 * reach)) & (np.abs(col) <= np.ceil(3 * reach))
+            derivative = np.where(inside, derivative - derivative[inside].mean(), 0)
+        derivative /= np.abs(derivative).sum()
+        np.testing.assert_allclose(kernel, derivative, atol=1e-5)
+
+
+def test_second_derivatives_answer_a_parabola_with_its_curvature():
+    """A valley is positive, a ridge negative, and along the valley nothing bends."""
+    kernels = leung_malik(1.0)[18:24]
+    half = kernels.shape[1] // 2
+    axis = np.arange(-half, half + 1.0)
+    valley = np.broadcast_to(axis**2, kernels.shape[1:])  # across the columns
+    across, along = ((kernels[i] * valley).sum() for i in (0, 3))
+    assert across > 5 * abs(along)
+
+
 def test_elongated_gaussians_are_three_times_longer_than_wide():
     kernel = np.abs(leung_malik(1.0)[0])  # first derivative across the columns
     axis = np.arange(kernel.shape[0]) - kernel.shape[0] // 2

@@ -5,6 +5,7 @@ import pytest
 
 from btfpipe.analysis import Features
 from btfpipe.analysis.filters import base_sigma, filter_pictures, leung_malik
+from btfpipe.analysis.pyramid import halve
 from btfpipe.analysis.textons import (
     appearance_vectors,
     cluster,
@@ -213,6 +214,64 @@ def test_representative_pictures_are_nearest_to_their_clusters_centre(model):
         drawn = pictures[rng.choice(model.n_pairs, 20, replace=False)]
         to_drawn = np.sqrt(((pictures[:, None] - drawn[None]) ** 2).sum(axis=2)).min(axis=1)
         assert to_chosen.mean() < to_drawn.mean()
+
+
+def test_the_representative_of_a_kind_is_the_one_nearest_to_its_mean(model):
+    """Pictures of a kind differ by a factor alone, so the nearest to the mean is known."""
+    textures, angular = eigen_textures(model)
+    rng = np.random.default_rng(8)
+    kinds = rng.permutation(np.repeat(np.arange(4), 15))
+    factor = 1 + 0.02 * rng.random(60) ** 2
+    many = (angular[[0, 40, 70, 100]][kinds] * factor[:, None, None]).astype(np.float32)
+    chosen = representative_pictures(textures, many, True, 4)
+    expected = []
+    for kind in range(4):
+        own = np.flatnonzero(kinds == kind)
+        expected.append(own[np.abs(factor[own] - factor[own].mean()).argmin()])
+    assert chosen.tolist() == sorted(expected)
+
+
+@pytest.mark.parametrize("different", [1, 3])
+def test_pictures_that_coincide_have_one_representative(model, different):
+    """Fewer kinds than representatives asked for: one of each, and no mean of nothing."""
+    textures, angular = eigen_textures(model)
+    kinds = np.tile(np.arange(different), 10)
+    many = angular[[0, 40, 100]][kinds]
+    chosen = representative_pictures(textures, many, True, 6)
+    assert sorted(kinds[chosen]) == list(range(different))
+
+
+def test_black_pictures_have_one_representative(model):
+    textures, angular = eigen_textures(model)
+    assert len(representative_pictures(textures, 0 * angular, True, 6)) == 1
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_filters_vary_alike_on_every_level_but_the_coarsest(make_sample, levels):
+    """Each level's textons are those of the responses to its own picture, scaled or as they are."""
+    model = compress_svd(make_sample(20, 24, toroidal=True), 3, precision="single")
+    features = texton_features(model, levels=levels, n_textons=60, k=5)
+    textures, angular = eigen_textures(model)
+    image = textures @ picture_weights(angular)
+    for level, found in enumerate(features.levels):
+        if level:
+            image = halve(image, True)
+        expected = {}
+        for alike in (True, False):
+            vectors = appearance_vectors(image, True)
+            energy = vectors.reshape(len(vectors), 48, -1).var(axis=0).sum(axis=1)
+            if alike:  # by the definition: the strongest keeps its own, the faintest of 2 % at most
+                factors = np.sqrt(energy.max() / np.maximum(energy, 4e-4 * energy.max()))
+                vectors = (vectors.reshape(len(vectors), 48, -1) * factors[:, None]).reshape(
+                    len(vectors), -1
+                )
+            textons = cluster(vectors.astype(np.float32), max(2, 60 // 4**level))
+            made = texton_level(textons, image.shape[:2]).gram
+            expected[alike] = np.linalg.norm(made)
+        coarsest = level == levels - 1
+        found = np.linalg.norm(found.gram)
+        assert found == pytest.approx(expected[not coarsest], rel=0.02)
+        assert found != pytest.approx(expected[coarsest], rel=0.2)
 
 
 def test_one_picture_is_enough(make_sample):

@@ -49,6 +49,28 @@ def test_a_surface_is_dressed_and_the_map_names_it(btfpipe, tmp_path, flat, imag
     assert [step["level"] for step in summary["steps"]] == [0] * 16
 
 
+def test_a_field_across_a_material_of_one_direction_is_warned_of(btfpipe, tmp_path, rng):
+    from shared_meshes import even_sphere
+
+    Surface([even_sphere(400)]).save(tmp_path / "sphere.surface.npz")
+    cords = np.sin(2 * np.pi * np.arange(24) / 6)[:, None, None] + 0.1 * rng.random((24, 24, 2))
+    np.save(tmp_path / "cords.npy", cords.astype(np.float32))
+    said = {}
+    for turn in (0, 90):
+        result = btfpipe(
+            "synthesize", tmp_path / "cords.npy", tmp_path / "sphere.surface.npz", "-o", tmp_path / f"{turn}.map.npz",
+            "--levels", 1, "--sweeps", 1, 1, "--turn-deg", turn, "--texels-per-unit", 6, "--json", "--quiet",
+        )  # fmt: skip
+        said[turn] = json.loads(result.stdout) | {"stderr": result.stderr}
+    assert said[0]["warnings"] == []
+    assert said[0]["stderr"] == ""
+    assert said[0]["dislocations"] == pytest.approx(said[90]["dislocations_turned_90"])
+    assert said[90]["dislocations"] > 8
+    (warning,) = said[90]["warnings"]
+    assert said[90]["stderr"] == f"Warning: {warning}.\n"
+    assert "--turn-deg 0 here" in warning
+
+
 def test_a_plane_from_a_picture(btfpipe, tmp_path, rng):
     from btfpipe.formats.images import write_picture
 

@@ -6,6 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 from scipy.fft import idct
+from shared_roots import NaiveRoots
 
 from btfpipe.analysis.textons import eigen_textures
 from btfpipe.compression import coded, open_appearance
@@ -132,21 +133,128 @@ def test_texels_and_pictures_agree(model):
     )
 
 
-@pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
-def test_shading_blends_the_values_as_a_sample_of_the_same_values_does(model, rng, interpolation):
-    plain = Sample(
-        whole(model), model.light_directions, model.view_directions, model.light_index, model.view_index, toroidal=True
+def upward(rng, n, lowest=0.0):
+    """Random unit vectors (n, 3) above a height."""
+    w = rng.normal(size=(n, 3))
+    w[:, 2] = np.abs(w[:, 2])
+    w = w[w[:, 2] > lowest * np.linalg.norm(w, axis=1)]
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+def values_kept(model):
+    """The Model's values as a Sample, whose values are blended as they are."""
+    return Sample(
+        whole(model), model.light_directions, model.view_directions, model.light_index, model.view_index,
+        toroidal=model.toroidal,
     )  # fmt: skip
-    n = 300
-    row, col = rng.random((2, n)) * 40 - 8
-    w_i, w_o = rng.normal(size=(2, n, 3))
-    w_i[:, 2], w_o[:, 2] = np.abs(w_i[:, 2]), np.abs(w_o[:, 2])
-    w_i, w_o = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in (w_i, w_o))
-    np.testing.assert_allclose(
-        model.evaluate(row, col, w_i, w_o, interpolation=interpolation),
-        plain.evaluate(row, col, w_i, w_o, interpolation=interpolation),
-        atol=2e-5,
+
+
+@pytest.fixture(scope="module")
+def few_terms(cloth):
+    return compress_coded(cloth, 100, n_terms=10)
+
+
+@pytest.mark.parametrize("toroidal", [True, False])
+@pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest", "reciprocal"])
+def test_shading_is_that_of_whole_vectors_of_roots(few_terms, rng, interpolation, toroidal):
+    model = few_terms
+    model.toroidal = toroidal
+    row, col = rng.random((2, 60)) * 40 - 8
+    w_i, w_o = upward(rng, 60), upward(rng, 60)
+    w_i[5] = [0.6, 0, -0.8]
+    found = model.evaluate(row, col, w_i, w_o, interpolation=interpolation)
+    naive = NaiveRoots(model, interpolation)
+    expected = [naive(*query) for query in zip(row, col, w_i, w_o, strict=True)]
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert np.max(expected) > 0.2
+    assert not found[5].any()
+
+
+def test_a_list_of_pairs_is_shaded_by_whole_vectors_of_roots(listed, rng):
+    model = compress_coded(listed, 6, n_terms=10)
+    row, col = rng.random((2, 60)) * 30
+    w_i, w_o = upward(rng, 60), upward(rng, 60)
+    for interpolation in ("barycentric", "four"):
+        naive = NaiveRoots(model, interpolation)
+        expected = [naive(*query) for query in zip(row, col, w_i, w_o, strict=True)]
+        found = model.evaluate(row, col, w_i, w_o, interpolation=interpolation)
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+        assert np.max(expected) > 0.2
+
+
+@pytest.fixture
+def listed(cloth):
+    """Some pairs of the cloth, no full grid."""
+    some = np.flatnonzero(np.random.default_rng(9).random(cloth.n_pairs) < 0.2)
+    return Sample(
+        cloth.codes[some], cloth.light_directions, cloth.view_directions, cloth.light_index[some], cloth.view_index[some],
+        transfer="srgb", absolute=True, toroidal=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
+@pytest.mark.parametrize("kind", ["grid", "list"])
+def test_at_texels_and_measured_pairs_the_pictures_are_shaded(
+    cloth, listed, rng, kind, interpolation
+):
+    # lowered, so that some roots are negative
+    source = values_kept(cloth if kind == "grid" else listed)
+    source.codes = source.codes - np.float32(0.15)
+    model = compress_coded(source, 20)
+    pair = rng.integers(0, model.n_pairs, 400)
+    row, col = rng.integers(0, 24, 400), rng.integers(0, 28, 400)
+    expected = whole(model)[pair, row, col]
+    found = model.evaluate(
+        row, col, model.light_directions[model.light_index[pair]], model.view_directions[model.view_index[pair]],
+        interpolation=interpolation,
+    )  # fmt: skip
+    np.testing.assert_allclose(found, expected, atol=3e-5)
+    assert (expected < -0.05).mean() > 0.1
+
+
+def test_between_texels_the_mean_brightness_is_that_of_blended_values(cloth):
+    model = compress_coded(cloth, 20)
+    blended = values_kept(model)
+    pair = np.repeat(np.arange(0, model.n_pairs, 7), 6)
+    row, col = np.random.default_rng(4).random((2, len(pair), 30)) * 24
+    w_i, w_o = (
+        np.repeat(d, 30, axis=0)
+        for d in (
+            model.light_directions[model.light_index[pair]],
+            model.view_directions[model.view_index[pair]],
+        )
     )
+    ours, theirs = (
+        who.evaluate(row.ravel(), col.ravel(), w_i, w_o).mean() for who in (model, blended)
+    )
+    assert ours == pytest.approx(theirs, rel=0.01)
+
+
+def test_between_directions_brightness_lies_half_way_between_blended_roots_and_values(rng):
+    # every pair another picture: what blending does to brightness is large
+    d = bonn81()[:37]
+    pair = np.arange(37 * 37)
+    values = rng.random((len(pair), 6, 6, 3)) ** 3 * d[pair % 37, 2][:, None, None, None]
+    sample = Sample(values.astype(np.float32), d, d, pair % 37, pair // 37, absolute=True)
+    model = compress_coded(sample, 3)
+    blended, naive = values_kept(model), NaiveRoots(model)
+    w_i, w_o = upward(rng, 400, 0.4)[:150], upward(rng, 400, 0.4)[:150]
+    row, col = rng.integers(0, 6, (2, 150))
+    ours = model.evaluate(row, col, w_i, w_o)
+    values = blended.evaluate(row, col, w_i, w_o).mean()
+    more = [naive._pairs(*w)[2] for w in zip(w_i, w_o, strict=True)]
+    roots = (ours / np.array(more)[:, None]).mean()
+    assert roots < 0.85 * values
+    assert roots + 0.3 * (values - roots) < ours.mean() < values
+
+
+def test_values_go_to_zero_with_the_cosine_beyond_the_last_ring(model):
+    w_o = [0, 0.6, 0.8]
+    theta = np.radians([80, 85, 89, 89.99])
+    w_i = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=1)
+    over_cosine = model.evaluate(3.3, 4.6, w_i, w_o) / w_i[:, 2:]
+    np.testing.assert_allclose(over_cosine, over_cosine[:1].repeat(4, axis=0), rtol=2e-3)
+    assert over_cosine.min() > 0.01
 
 
 def test_threads_never_show(cloth, model, tmp_path):

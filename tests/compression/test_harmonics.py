@@ -290,6 +290,67 @@ def test_shading_agrees_with_texels_and_blends_between_them(rng):
     np.testing.assert_allclose(between, sum(corners), atol=1e-5)
 
 
+def naive_value(model, row, col, w_i, w_o):
+    """Y_v(w_o) C Y_l(w_i)^T at a texel, whatever the directions."""
+    view = spherical_harmonics([w_o], model.view_terms)[0]
+    light = spherical_harmonics([w_i], model.light_terms)[0]
+    return np.einsum("i,cij,j->c", view, model.coefficients([row], [col])[0], light)
+
+
+@pytest.fixture(scope="module")
+def rough():
+    """A Model of values so unlike a few harmonics that these ring: noise, cosine inside. Lights to 75, views to 60 degrees."""
+    lights, views = bonn81(), bonn81()[:57]
+    values = (
+        np.random.default_rng(6).random((57, 81, 2, 3, 3)) ** 4 * lights[:, 2, None, None, None]
+    )
+    return compress_harmonics(product_sample(values, lights, views), 25, 25)
+
+
+def test_within_the_measured_rings_values_are_those_of_the_harmonics(rough, rng):
+    theta = rng.random((2, 40)) * np.radians([[74.99], [59.99]])
+    phi = rng.random((2, 40)) * 6.3
+    for w_i, w_o in zip(*from_angles(theta, phi), strict=True):
+        found = rough.evaluate(1, 2, w_i, w_o)[0]
+        np.testing.assert_allclose(found, naive_value(rough, 1, 2, w_i, w_o), atol=1e-4)
+
+
+def test_beyond_the_last_ring_value_over_cosine_is_that_of_the_ring(rough, rng):
+    for phi_i, phi_o in rng.random((20, 2)) * 6.3:
+        ring_i, ring_o = (from_angles(np.radians(t), p) for t, p in ((75, phi_i), (60, phi_o)))
+        expected = naive_value(rough, 0, 1, ring_i, ring_o) / ring_i[2]
+        for theta_i, theta_o in np.radians([(75.01, 70), (80, 60.01), (89.9, 89.9), (85, 95)]):
+            w_i, w_o = from_angles(theta_i, phi_i), from_angles(theta_o, phi_o)
+            found = rough.evaluate(0, 1, w_i, w_o)[0] / w_i[2]
+            np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_values_are_continuous_from_the_normal_to_the_horizon(rough):
+    theta = np.radians(np.arange(0, 90.01, 0.02))
+    fixed = from_angles(np.radians(50.0), 2.0)
+    for moves in ("light", "view"):
+        w = from_angles(theta, 1.1)
+        found = rough.evaluate(1, 1, *((w, fixed) if moves == "light" else (fixed, w)))
+        assert np.abs(np.diff(found, axis=0)).max() < 0.003 * np.abs(found).max()
+        assert np.ptp(found) > 0.2 * np.abs(found).max()
+    assert not rough.evaluate(1, 1, [1, 0, 0], fixed).any()
+
+
+def test_many_lights_fade_as_one_does(rough, rng):
+    shader = rough.shader()
+    n = 200
+    row, col = (rng.random((2, n)) * 2).astype(np.float32)
+    w_i, w_o = (
+        from_angles(np.radians(60 + 35 * rng.random(n)), 6.3 * rng.random(n)).astype(np.float32)
+        for _ in range(2)
+    )
+    one, many = np.empty((2, n, 3), np.float32)
+    shader.shade(row, col, w_i, w_o, one)
+    shader.slices(row, col, w_o).shade(np.arange(n), w_i, many)
+    np.testing.assert_allclose(many, one, atol=1e-5)
+    assert np.abs(one).max() > 0.1
+
+
 def test_light_from_below_gives_nothing(rng):
     model = compress_harmonics(smooth_sample(rng, 1, 1), 4, 9)
     below = from_angles([np.pi / 2, 1.6, 3.0], 0.3)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from btfpipe.compression import compress, open_appearance
+from btfpipe.compression import compress, local_pca, open_appearance
 from btfpipe.compression import local_clusters as local_clusters_module
 from btfpipe.compression.local_clusters import local_clusters
 from btfpipe.compression.local_pca import LocalPcaModel, compress_local_pca
@@ -72,6 +72,19 @@ def test_each_cluster_has_its_best_approximation_of_that_rank(patchy_sample, clu
     assert least * (1 - 1e-6) <= error <= 1.005 * least
     # the best approximation is also near in itself, where the singular values are apart
     assert np.linalg.norm(matrix(model) - best) < 0.15 * least
+
+
+def test_clusters_have_the_directions_of_the_samples_own_values(patchy_sample, monkeypatch):
+    """Clusters are found in few dimensions; what they are given comes from all values, not from those few."""
+    monkeypatch.setattr(local_pca, "REDUCED_TERMS", 8)
+    sample = patchy_sample((16, 20), rank=8, noise=0.3)
+    model = compress_local_pca(sample, clusters=3, components=3, precision="single")
+    values = matrix(sample)
+    least = np.linalg.norm(naive(values, model.labels, 3) - values)
+    assert np.linalg.norm(matrix(model) - values) <= 1.015 * least
+    for label in range(3):
+        own = values[model.labels == label].mean(axis=0)
+        np.testing.assert_allclose(model.bases[label, ..., 0].ravel(), own, atol=1e-5)
 
 
 @settings(max_examples=15, deadline=None)

@@ -259,3 +259,14 @@ def test_progress_ends_at_its_total(noisy_sample):
     compress_view_pca(noisy_sample(), on_progress=lambda done, total: seen.append((done, total)))
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert {total for _, total in seen} == {seen[-1][0]}
+
+
+def test_bytes_are_the_nearest_to_the_textures(noisy_sample):
+    """Not those below: every texture would be darker by half a step."""
+    sample = noisy_sample(24, 20)
+    exact = compress_view_pca(sample, 3, precision="single").textures
+    stored = compress_view_pca(sample, 3, precision="byte").textures
+    assert stored.dtype == np.int8
+    off = stored / 127 - exact
+    assert np.abs(off).max() < 0.501 / 127
+    assert abs(off.mean()) < 0.01 / 127

@@ -90,6 +90,23 @@ def test_nearest_directions_are_the_nearest(name, method, count, rng):
     np.testing.assert_allclose(np.sort(found, axis=1), true, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", SETS)
+def test_weights_of_the_four_nearest_are_those_of_the_definition(name, rng):
+    """Squares of what each is nearer than the first one left out, in inverse distances (Franke and Little)."""
+    directions = SETS[name]
+    queries = np.concatenate([somewhere(400, rng), from_angles(np.pi / 2, np.linspace(0, 6.2, 50))])
+    found = dense(Hemisphere(directions, "four"), queries)
+    distance = np.linalg.norm(directions[None] - queries[:, None], axis=2)
+    order = np.argsort(distance, axis=1)
+    for query, near in enumerate(order):
+        expected = np.zeros(len(directions))
+        # none is left out: none is farther than the sphere's diameter
+        radius = distance[query, near[4]] if len(directions) > 4 else 2.0
+        for k in near[:4]:
+            expected[k] = (1 / distance[query, k] - 1 / radius) ** 2
+        np.testing.assert_allclose(found[query], expected / expected.sum(), atol=1e-6)
+
+
 @pytest.mark.parametrize("method", ["barycentric", "four"])
 def test_weights_are_continuous(method, rng):
     hemisphere = Hemisphere(bonn81(), method)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
 from btfpipe.rendering.objects import dress, patch
 from btfpipe.sample import Sample
@@ -49,6 +50,51 @@ def test_rolled_map_rolls_the_sample_across_its_border(
     mapped, bare = (render_file(scene_file([e], camera=VIEW, film=film)) for e in (entry, plain))
     expected = np.roll(bare[..., :3], (-5, -11), axis=(0, 1))
     np.testing.assert_allclose(mapped[..., :3], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("shift", [(5, 0), (0, 11), (5, 11)])
+def test_a_rolled_map_is_interpolated_across_the_samples_border(
+    make_sample, scene_file, render_file, tmp_path, shift
+):
+    """Three pixels a texel: inside the triangles that cross the border, too, coordinates go the short way."""
+    make_sample(rows=16, cols=16, toroidal=True).save(tmp_path / "m.sample.npz")
+    row, col = np.mgrid[:16.0, :16.0]
+    entry = plane_map(tmp_path, (row + shift[0]) % 16, (col + shift[1]) % 16)
+    plain = {"plane": PLANE, "model": "m.sample.npz"}
+    mapped, bare = (render_file(scene_file([e], camera=VIEW, film=FILM)) for e in (entry, plain))
+    expected = np.roll(bare, (-3 * shift[0], -3 * shift[1]), axis=(0, 1))
+    np.testing.assert_allclose(mapped[..., :3], expected[..., :3], atol=5e-5)
+    # and so do the layers that say which texel is seen
+    difference = mapped[..., 8:] - expected[..., 8:]
+    np.testing.assert_allclose((difference + 8) % 16 - 8, 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_frames_behind_a_surface_are_mirrored(scene_file, render_file, tmp_path, behind, turn):
+    """The material of the back is the front's seen in a mirror that lies in the surface: s and t stay in place.
+
+    Its value tells every direction of light and view from any other.
+    """
+    directions = bonn81()
+    pair = np.arange(81 * 81)
+    by_light, by_view = directions @ [0.31, 0.17, 0.9], directions @ [0.22, -0.29, 0.9]
+    value = by_light[pair % 81] * (1 + by_view[pair // 81]) / 3
+    codes = value[:, None, None, None] * np.ones((1, 2, 2, 3))
+    sample = Sample(codes.astype(np.float32), directions, directions, pair % 81, pair // 81)
+    sample.save(tmp_path / "m.sample.npz")
+    s, t = [np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0]
+    entry = {"plane": PLANE | {"s": s, "t": t}, "model": "m.sample.npz"}
+    for light, view in ((20, 9), (35, 31), (50, 12)):
+        side = np.array([1, 1, -1 if behind else 1])
+        towards = [
+            side * (d[0] * np.array(s) + d[1] * np.array(t) + [0, 0, d[2]])
+            for d in directions[[light, view]]
+        ]
+        lamp = {"type": "directional", "direction": towards[0], "irradiance": [np.pi] * 3}
+        camera = VIEW | {"position": 5 * towards[1], "height": 0.2}
+        picture = render_file(scene_file([entry], camera=camera, film=FILM, lights=[lamp]))
+        np.testing.assert_allclose(picture[..., :3], value[81 * view + light], rtol=1e-4)
 
 
 def grid_mesh(n=9):

@@ -56,7 +56,7 @@ def shade(environment, row, col, frames, w_o, **kwargs):
 
 def summed(model, coefficients, row, col, frame, w_o):
     """The integral of value * radiance / pi over the hemisphere, by the model's own evaluation."""
-    w_i, weights = quadrature(40, hemisphere=True)
+    w_i, weights = quadrature(200, hemisphere=True)  # many nodes: the last ring is a kink
     radiance = spherical_harmonics(w_i @ frame, len(coefficients)) @ coefficients
     values = model.evaluate(row, col, w_i, w_o)
     return (weights[:, None] * values * radiance).sum(axis=0) / np.pi

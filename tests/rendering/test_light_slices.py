@@ -5,9 +5,8 @@ import pytest
 
 from btfpipe.compression.coded import compress_coded
 from btfpipe.compression.harmonics import compress_harmonics
+from btfpipe.compression.light_slices import LightSlices
 from btfpipe.parallel import single_threaded_blas
-from btfpipe.sample import Sample
-from btfpipe.sample.light_slices import LightSlices
 
 
 @pytest.fixture
@@ -31,13 +30,9 @@ def directions(rng, n, lowest=0.0):
 
 @pytest.mark.parametrize("interpolation", ["barycentric", "four", "nearest"])
 @pytest.mark.parametrize("toroidal", [True, False])
-def test_slices_show_what_a_sample_of_the_same_values_shows(model, rng, interpolation, toroidal):
+def test_slices_show_what_the_model_shows_light_by_light(model, rng, interpolation, toroidal):
     """Look-ups beyond the borders, views and lights at the horizon, lights below it."""
     model.toroidal = toroidal
-    twin = Sample(
-        model.pictures(slice(0, model.n_pairs)), model.light_directions, model.view_directions,
-        model.light_index, model.view_index, toroidal=toroidal,
-    )  # fmt: skip
     n = 3000
     row, col = (rng.uniform(-4, 18, n).astype(np.float32) for _ in range(2))
     w_o = directions(rng, n)
@@ -48,7 +43,7 @@ def test_slices_show_what_a_sample_of_the_same_values_shows(model, rng, interpol
         w_i = directions(rng, len(chosen), -0.2)
         found = np.full((len(chosen), 3), np.nan, np.float32)
         slices.shade(chosen, w_i, found)
-        expected = twin.evaluate(
+        expected = model.evaluate(
             row[chosen], col[chosen], w_i, w_o[chosen], interpolation=interpolation
         )
         np.testing.assert_allclose(found, expected, atol=2e-5)

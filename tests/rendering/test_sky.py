@@ -7,6 +7,7 @@ from btfpipe.compression.harmonics import compress_harmonics
 from btfpipe.directions import bonn81
 from btfpipe.errors import InputError
 from btfpipe.formats.images import colours, open_picture, write_picture
+from btfpipe.rendering import kernels
 from btfpipe.rendering.renderer import render
 from btfpipe.rendering.scene import load_scene
 from btfpipe.sample import Sample
@@ -138,6 +139,41 @@ def test_a_wall_hides_its_share_of_the_sky(white):
     np.testing.assert_allclose(hidden, 0.5, atol=0.06)
     whole = picture(white.parent, "harmonics", ", occlusion_rays: 0", wall, (1, 9))[0, 4]
     np.testing.assert_allclose(whole, 1, atol=0.01)
+
+
+@pytest.mark.parametrize("side", [4.0, 8.0, 16.0])
+def test_a_ceiling_hides_what_its_form_factor_says(white, side):
+    """A square card four units above hides more the higher it stands in the sky, by the cosine."""
+    write_map(white.parent / "map.exr", lambda d: np.ones((*d.shape[:-1], 3)))
+    card = (
+        f"- {{plane: {{center: [0, 0, 4], s: [1, 0, 0], t: [0, 1, 0], size: [{side}, {side}]}},"
+        " albedo: [0, 0, 0]}\n"
+    )
+    seen = picture(white.parent, "harmonics", ", occlusion_rays: 1024", card, (3, 3))[1, 1]
+    # of a differential element and a rectangle above its corner, four times (Siegel and Howell)
+    a = side / 2 / 4
+    part = a / np.sqrt(1 + a * a) * np.arctan(a / np.sqrt(1 + a * a)) / np.pi
+    np.testing.assert_allclose(seen, 1 - 4 * part, atol=0.035)
+
+
+@pytest.mark.parametrize("normal", [[0, 0, 1], [0, 0, -1], [0.6, 0, 0.8], [0.48, -0.6, -0.64]])
+def test_rays_of_ambient_visibility_follow_the_cosine(normal):
+    """Moments of the cosine's distribution: of the height 2/3 and 1/2, across it none and a quarter each way."""
+    points, rays = 400, 16
+    normals = np.tile(np.array(normal, float), (points, 1))
+    start, chosen = np.arange(3.0 * points).reshape(points, 3), np.arange(points)
+    origin, toward = (np.empty((points * rays, 3), np.float32) for _ in range(2))
+    kernels.cosine_rays(start, normals, chosen, 7 * chosen, rays, 3, origin, toward)
+    np.testing.assert_array_equal(origin, np.repeat(start, rays, axis=0))
+    np.testing.assert_allclose(np.linalg.norm(toward, axis=1), 1, atol=1e-6)
+    height = toward @ normals[0]
+    assert height.min() >= 0
+    assert height.mean() == pytest.approx(2 / 3, abs=0.01)
+    assert np.square(height).mean() == pytest.approx(1 / 2, abs=0.01)
+    across = toward - height[:, None] * normals[0]
+    np.testing.assert_allclose(across.mean(axis=0), 0, atol=0.01)
+    spread = across.T @ across / len(across)
+    np.testing.assert_allclose(spread, (np.eye(3) - np.outer(normal, normal)) / 4, atol=0.01)
 
 
 def test_a_scene_without_a_model_of_harmonics_is_told_so(white, make_sample):

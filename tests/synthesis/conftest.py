@@ -46,6 +46,12 @@ def grid():
 
 
 @pytest.fixture
+def link():
+    """Give a level its places on a coarser one."""
+    return _link
+
+
+@pytest.fixture
 def sphere():
     """Make a sphere level of n vertices."""
     return even_sphere

@@ -9,12 +9,27 @@ from btfpipe.synthesis.coherence import coherence_facts
 from btfpipe.synthesis.plane import grow_over_plane
 
 
-def naive_sweep(features, out, done, k, kappa):
-    """One sweep over a one-level plane, texel by texel, with nothing but the definitions; `out` (rows, cols, 2)."""
-    level = features.levels[0]
+def squares_of(image, side):
+    """The vectors of the square about every place of a toroidal image, (rows, cols, side * side, d)."""
+    around = range(-(side // 2), side // 2 + 1)
+    return np.stack([np.roll(image, (-i, -j), (0, 1)) for i in around for j in around], axis=2)
+
+
+def naive_sweep(features, i, out, below, done, k, kappa):
+    """One sweep over level i of a plane, texel by texel, with nothing but the definitions.
+
+    `out` (rows, cols, 2) is changed in place, and so is `done`; `below` is the next coarser level's, or None.
+    """
+    level = features.levels[i]
     rows, cols = level.shape
     image = level.vectors[level.labels].astype(np.float64)
     offsets = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
+    squares = squares_of(image, 5)
+    if below is not None:
+        coarse = features.levels[i + 1]
+        coarse = coarse.vectors[coarse.labels].astype(np.float64)
+        coarse_squares = squares_of(coarse, 3)
+        ours = squares_of(coarse[below[..., 0], below[..., 1]], 3)
 
     def inside(r, c):
         return features.toroidal or (2 <= r < rows - 2 and 2 <= c < cols - 2)
@@ -22,7 +37,8 @@ def naive_sweep(features, out, done, k, kappa):
     for r in range(out.shape[0]):
         for c in range(out.shape[1]):
             around = [(i, j, (r + i) % out.shape[0], (c + j) % out.shape[1]) for i, j in offsets]
-            around = [(i, j, y, x) for i, j, y, x in around if done[y, x]]
+            known = [n for n, (_, _, y, x) in enumerate(around) if done[y, x]]
+            around = [around[n] for n in known]
             if not around:
                 done[r, c] = True
                 continue
@@ -42,35 +58,51 @@ def naive_sweep(features, out, done, k, kappa):
                 for t in level.neighbours[s, e, 1:k] if k > 1 else ():
                     if divmod(int(t), cols) not in votes:
                         penalty[divmod(int(t), cols)] = 1 + kappa
+            seen = np.array([image[tuple(out[y, x])] for _, _, y, x in around])
             best, lowest = None, np.inf
             for (s, e), factor in penalty.items():
-                distance = sum(
-                    np.sum((image[tuple(out[y, x])] - image[(s + i) % rows, (e + j) % cols]) ** 2)
-                    for i, j, y, x in around
-                )
+                distance = ((seen - squares[s, e][known]) ** 2).sum()
+                if below is not None:
+                    distance += ((ours[r // 2, c // 2] - coarse_squares[s // 2, e // 2]) ** 2).sum()
                 if factor * distance < lowest:
                     best, lowest = (s, e), factor * distance
             out[r, c] = best
             done[r, c] = True
 
 
-@pytest.mark.parametrize("kappa", [0.0, 0.7])
-def test_compiled_growth_equals_its_naive_twin(make_features, kappa):
-    features = make_features(k=6, smooth=False)
-    shape, seed, sweeps = (9, 11), 5, 2
-    out = np.empty((*shape, 2), int)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            item = r * shape[1] + c
-            out[r, c] = [int(uniform(seed, item, d) * (16, 20)[d]) for d in (0, 1)]
-    done = np.zeros(shape, bool)
-    for _ in range(sweeps):
-        naive_sweep(features, out, done, 6, 0.0)  # coherence does not count on the coarsest level
-    grown = grow_over_plane(
-        features, shape, k=6, levels=1, sweeps=(sweeps, 1), coherence=kappa, seed=seed
-    )
-    np.testing.assert_array_equal(grown.row.reshape(shape), out[..., 0])
-    np.testing.assert_array_equal(grown.col.reshape(shape), out[..., 1])
+def naive_growth(features, shape, k, sweeps, coherence, seed):
+    """Rows and cols of the sample, (rows, cols, 2), that a plane of this shape gets."""
+    below, count = None, len(features.levels)
+    for i in reversed(range(count)):
+        rows, cols = shape[0] >> i, shape[1] >> i
+        size = features.levels[i].shape
+        out = np.empty((rows, cols, 2), int)
+        for r in range(rows):
+            for c in range(cols):
+                if below is None:
+                    out[r, c] = [int(uniform(seed, r * cols + c, d) * size[d]) for d in (0, 1)]
+                else:
+                    out[r, c] = 2 * below[r // 2, c // 2] + [r % 2, c % 2]
+        done = np.full((rows, cols), below is not None)
+        for _ in range(sweeps[0] if below is None else sweeps[1]):
+            # coherence does not count on the coarsest level
+            kappa = 0.0 if below is None else coherence / 2**i
+            naive_sweep(features, i, out, below, done, k, kappa)
+        below = out
+    return out
+
+
+@pytest.mark.parametrize(
+    ("shape", "levels", "coherence"), [((9, 11), 1, 0.0), ((9, 11), 1, 0.7), ((24, 20), 3, 0.7)]
+)
+def test_compiled_growth_equals_its_naive_twin(make_features, shape, levels, coherence):
+    size = {"rows": 20, "cols": 28} if levels > 1 else {}
+    features = make_features(k=6, smooth=False, levels=levels, **size)
+    options = {"k": 6, "sweeps": (2, 1), "coherence": coherence, "seed": 5}
+    expected = naive_growth(features, shape, **options)
+    grown = grow_over_plane(features, shape, levels=levels, **options)
+    np.testing.assert_array_equal(grown.row.reshape(shape), expected[..., 0])
+    np.testing.assert_array_equal(grown.col.reshape(shape), expected[..., 1])
 
 
 def test_both_forms_of_the_distance_choose_alike(make_features):

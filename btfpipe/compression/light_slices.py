@@ -1,17 +1,18 @@
 """The same look-ups under many lights: what does not hang on the light is done once.
 
 At one texel and from one view a BTF is a function of the light alone: a slice of it. A slice under all measured lights
-costs what some single lights do, less where look-ups share texels; each further light then only interpolates.
+costs what some single lights do, less where look-ups share texels; each further light then only interpolates. What is
+interpolated is square roots of values (`btfpipe.compression.root_blending`).
 """
 
 import numpy as np
 
 from btfpipe.compiled import leaf
-from btfpipe.directions.interpolation import find
+from btfpipe.compression.root_blending import texel_gain
 from btfpipe.parallel import blocks
 from btfpipe.sample.shading import corners
 
-_LOOKUPS = 2048  # whose texels are evaluated together; their values stay in the cache
+_LOOKUPS = 2048  # whose texels are evaluated together; their roots stay in the cache
 
 
 class LightSlices:
@@ -22,8 +23,9 @@ class LightSlices:
     Parameters
     ----------
     shader : PairShader
-        Of a product of views and lights, with a method ``seen(texels, view)`` that gives the linear values (n, lights, 3)
-        float32 of texels (n,), numbered row by row, from a measured view.
+        Of a product of views and lights, with ``pairs``, `RootWeights`; ``products``, those of its `RootTables`; and a method
+        ``seen(texels, view)`` that gives the roots (n, lights, 3) float32 of texels (n,), numbered row by row, from a
+        measured view.
     row, col : (n,) float32
         Texel coordinates.
     w_o : (n, 3) float32
@@ -32,14 +34,16 @@ class LightSlices:
 
     def __init__(self, shader, row, col, w_o):
         self.pairs = shader.pairs
-        texel, bilinear = np.empty((len(row), 4), np.int32), np.empty((len(row), 4), np.float32)
-        _all_corners(row, col, shader.rows, shader.cols, shader.toroidal, texel, bilinear)
-        view, share = np.zeros((len(row), 4), np.int32), np.zeros((len(row), 4))
-        find(self.pairs.views, w_o, view, share)
-        self.values = np.zeros((len(row), len(self.pairs.inverse_cosines), 3), np.float32)
+        texel, bilinear = np.empty((len(row), 4), np.int64), np.empty((len(row), 4), np.float32)
+        _all_corners(
+            row, col, shader.rows, shader.cols, shader.toroidal, shader.products, texel, bilinear
+        )
+        view, weight = np.zeros((len(row), 4), np.int32), np.zeros((len(row), 4))
+        self.pairs.find_views(w_o, view, weight)
+        self.roots = np.zeros((len(row), len(self.pairs.roots), 3), np.float32)
         number = np.full(shader.rows * shader.cols, -1, np.int32)
-        order = np.argsort(np.where(share > 0, view, -1), axis=None, kind="stable")
-        order = order[np.count_nonzero(share <= 0) :]
+        order = np.argsort(np.where(weight > 0, view, -1), axis=None, kind="stable")
+        order = order[np.count_nonzero(weight <= 0) :]
         bounds = np.flatnonzero(np.diff(view.ravel()[order])) + 1
         for items in np.split(order, bounds):
             for part in blocks(len(items), _LOOKUPS):
@@ -48,10 +52,7 @@ class LightSlices:
                 texels = np.empty(4 * len(some), np.int32)
                 texels = texels[: _list_texels(texel, lookup, number, texels)]
                 seen = shader.seen(texels, int(view.ravel()[some[0]]))
-                _add(
-                    seen, self.pairs.inverse_cosines, texel, bilinear, lookup, share.ravel()[some], number,
-                    self.values,
-                )  # fmt: skip
+                _add(seen, texel, bilinear, lookup, weight.ravel()[some], number, self.roots)
                 number[texels] = -1
 
     def shade(self, chosen, w_i, out):
@@ -66,9 +67,9 @@ class LightSlices:
         out : (m, 3) float32
             Filled in place.
         """
-        light, share = np.zeros((len(chosen), 4), np.int32), np.zeros((len(chosen), 4))
-        find(self.pairs.lights, w_i, light, share)
-        _interpolate(self.values, chosen, light, share, w_i, out)
+        light, weight = np.zeros((len(chosen), 4), np.int32), np.zeros((len(chosen), 4))
+        self.pairs.find_lights(w_i, light, weight)
+        _interpolate(self.roots, chosen, light, weight, out)
 
 
 def slice_bytes(lights):
@@ -77,9 +78,13 @@ def slice_bytes(lights):
 
 
 @leaf
-def _all_corners(row, col, rows, cols, toroidal, texel, bilinear):
+def _all_corners(row, col, rows, cols, toroidal, products, texel, weight):
+    """Texels around look-ups and the weights of their roots."""
     for q in range(len(row)):
-        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel[q], bilinear[q])
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel[q], weight[q])
+        gain = np.float32(texel_gain(products, texel[q], weight[q]))
+        for k in range(4):
+            weight[q, k] *= gain
 
 
 @leaf
@@ -96,40 +101,37 @@ def _list_texels(texel, lookup, number, texels):
 
 
 @leaf(fastmath={"contract"})
-def _add(seen, inverse_cosines, texel, bilinear, lookup, share, number, out):
-    """Add the texels' values from one view, divided by the lights' cosines, to the look-ups' slices."""
+def _add(seen, texel, bilinear, lookup, weight, number, out):
+    """Add the texels' roots from one view to the look-ups' slices."""
     for at in range(len(lookup)):
         q = lookup[at]
         a = seen[number[texel[q, 0]]]
         b = seen[number[texel[q, 1]]]
         c = seen[number[texel[q, 2]]]
         d = seen[number[texel[q, 3]]]
-        w = np.float32(share[at])
+        w = np.float32(weight[at])
         wa = w * bilinear[q, 0]
         wb = w * bilinear[q, 1]
         wc = w * bilinear[q, 2]
         wd = w * bilinear[q, 3]
         to = out[q]
         for i in range(out.shape[1]):
-            cosine = np.float32(inverse_cosines[i])
             for k in range(3):
-                sum_ = wa * a[i, k] + wb * b[i, k] + wc * c[i, k] + wd * d[i, k]
-                to[i, k] += cosine * sum_
+                to[i, k] += wa * a[i, k] + wb * b[i, k] + wc * c[i, k] + wd * d[i, k]
 
 
 @leaf(fastmath={"contract"})
-def _interpolate(values, chosen, light, share, w_i, out):
+def _interpolate(roots, chosen, light, weight, out):
     for q in range(len(chosen)):
         red = np.float32(0)
         green = np.float32(0)
         blue = np.float32(0)
-        cosine = max(w_i[q, 2], np.float32(0))
-        slice_ = values[chosen[q]]
+        slice_ = roots[chosen[q]]
         for k in range(light.shape[1]):
-            w = np.float32(share[q, k]) * cosine
+            w = np.float32(weight[q, k])
             red += w * slice_[light[q, k], 0]
             green += w * slice_[light[q, k], 1]
             blue += w * slice_[light[q, k], 2]
-        out[q, 0] = red
-        out[q, 1] = green
-        out[q, 2] = blue
+        out[q, 0] = red * abs(red)
+        out[q, 1] = green * abs(green)
+        out[q, 2] = blue * abs(blue)

@@ -1,0 +1,266 @@
+"""Blending square roots of values between texels, lights and views, without the loss of brightness.
+
+The square of a mean of roots is less than the mean of their squares, by the variance of the roots:
+a picture blended so is too dark between the measured directions and texels. The roots are therefore
+blended with weights that are a little larger:
+
+- Between texels so much that the mean over all pairs is that of blended values, as an interpolated
+  normal is given its length again.
+- Between lights, and between views, half of that (the square root of the factor): blended *values*
+  are too bright there, as they show a highlight or a lit yarn at two places instead of one between.
+
+The factors come from scalar products of the roots, summed over all pairs or all texels. The SVD's
+factors are orthogonal to each other, so that such a sum is one over the terms.
+"""
+
+import numpy as np
+
+from btfpipe.compiled import leaf
+from btfpipe.directions.interpolation import find
+from btfpipe.parallel import blocks, single_threaded_blas
+from btfpipe.sample.shading import PairWeights
+
+_QUERIES = 8192  # whose pairs are listed at a time
+_MOST = 16.0  # of a factor: as many directions as are ever blended, of which only one is lit
+
+
+class RootTables:
+    """What a Model of square roots has to know of its factors to blend them.
+
+    Parameters
+    ----------
+    texture : (rows, cols, n) float32
+    angular : list of (pairs, n_k) float32
+        Of colours, whose roots' squares add up to those of the channels.
+    appearance : Appearance
+        Gives the pairs.
+
+    Attributes
+    ----------
+    texels : (rows * cols, 5) float32
+        Scalar products of each texel's roots with its own, and with those of the texels to the
+        right, below, and below to the right; and of the texels to the right and below with each
+        other. Beyond its borders the sample goes on at the other side.
+    lights, views : (n, n) float64
+        Scalar products of the roots of value / cos(theta_i) under each light and from each view;
+        only of a full grid.
+    importance : (n,) float32
+        Sum of the squares of each term over the texels.
+    """
+
+    def __init__(self, texture, angular, appearance):
+        n = texture.shape[2]
+        self.importance = np.zeros(n, np.float32)
+        for row in texture:
+            self.importance += np.square(row).sum(axis=0)
+        power = np.zeros(n, np.float32)
+        for part in angular:
+            for some in blocks(len(part), _QUERIES):
+                power[: part.shape[1]] += np.square(part[some]).sum(axis=0)
+        self.texels = np.empty((texture.shape[0] * texture.shape[1], 5), np.float32)
+        _multiply_neighbours(texture, power, self.texels)
+        if appearance.is_product:
+            self.lights, self.views = _direction_products(angular, self.importance, appearance)
+
+
+def _direction_products(angular, importance, appearance):
+    """Scalar products (lights, lights) and (views, views) of the roots of value / cos(theta_i)."""
+    from btfpipe.sample.appearance import light_cosines
+
+    lights, views = len(appearance.light_directions), len(appearance.view_directions)
+    scale = np.sqrt(1 / light_cosines(appearance.light_directions)).astype(np.float32)
+    out = np.zeros((lights, lights)), np.zeros((views, views))
+    with single_threaded_blas():
+        for part in angular:
+            part = part.reshape(views, lights, -1)
+            each = np.sqrt(importance[: part.shape[2]])
+            for seen in part:
+                scaled = seen * each * scale[:, None]
+                out[0][:] += scaled @ scaled.T
+            for light in range(lights):
+                scaled = part[:, light] * each * scale[light]
+                out[1][:] += scaled @ scaled.T
+    return out
+
+
+@leaf(fastmath={"contract", "reassoc", "nsz"})
+def _dot(a, b, power):
+    total = np.float32(0)
+    for k in range(len(power)):
+        total += a[k] * b[k] * power[k]
+    return total
+
+
+@leaf
+def _multiply_neighbours(texture, power, out):
+    rows, cols = texture.shape[:2]
+    for i in range(rows):
+        below = (i + 1) % rows
+        for j in range(cols):
+            right = (j + 1) % cols
+            a = texture[i, j]
+            to = out[i * cols + j]
+            to[0] = _dot(a, a, power)
+            to[1] = _dot(a, texture[i, right], power)
+            to[2] = _dot(a, texture[below, j], power)
+            to[3] = _dot(a, texture[below, right], power)
+            to[4] = _dot(texture[i, right], texture[below, j], power)
+
+
+@leaf
+def texel_gain(products, texel, weight):
+    """What four texels' blended roots are multiplied by to keep their mean square."""
+    a = products[texel[0]]
+    b = products[texel[1]]
+    c = products[texel[2]]
+    d = products[texel[3]]
+    kept = weight[0] * a[0] + weight[1] * b[0] + weight[2] * c[0] + weight[3] * d[0]
+    blended = weight[0] * weight[0] * a[0] + weight[1] * weight[1] * b[0]
+    blended += weight[2] * weight[2] * c[0] + weight[3] * weight[3] * d[0]
+    mixed = weight[0] * (weight[1] * a[1] + weight[2] * a[2] + weight[3] * a[3])
+    mixed += weight[1] * weight[2] * a[4] + weight[1] * weight[3] * b[2]
+    mixed += weight[2] * weight[3] * c[1]
+    return np.sqrt(_factor(kept, blended + 2 * mixed))
+
+
+@leaf
+def _factor(kept, blended):
+    """A mean of squares over the square of a mean; 1 where all is black."""
+    return kept / max(blended, kept / _MOST) if kept > 0 else 1.0
+
+
+@leaf
+def _direction_gain(products, index, weight):
+    """What the blended roots of some directions are multiplied by."""
+    kept = 0.0
+    blended = 0.0
+    for i in range(len(index)):
+        kept += weight[i] * products[index[i], index[i]]
+        for j in range(len(index)):
+            blended += weight[i] * weight[j] * products[index[i], index[j]]
+    return np.sqrt(np.sqrt(_factor(kept, blended)))
+
+
+class RootWeights(PairWeights):
+    """Finds the pairs of which roots are blended, and their weights.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    interpolation : str
+        See `PairWeights`.
+    tables : RootTables
+    angular : list of (pairs, n_k) float32
+        As for `RootTables`. A list of pairs has no tables of directions: its factors are found
+        query by query.
+    """
+
+    def __init__(self, appearance, interpolation, tables, angular):
+        super().__init__(appearance, interpolation)
+        self.roots = np.sqrt(self.inverse_cosines)
+        self.tables = tables
+        if self.near is not None:
+            self.angular = angular
+            self.power = np.zeros(appearance.n_pairs, np.float32)
+            for part in angular:
+                for some in blocks(len(part), _QUERIES):
+                    self.power[some] += np.square(part[some]) @ tables.importance[: part.shape[1]]
+
+    def find_lights(self, w_i, light, weight):
+        """Fill `light`, `weight` (n, 4) for lights (n, 3): of roots, cosine and gain inside."""
+        find(self.lights, w_i, light, weight)
+        _weigh_lights(self.tables.lights, self.roots, w_i, light, weight)
+
+    def find_views(self, w_o, view, weight):
+        """Fill `view`, `weight` (n, 4) for views (n, 3): weights of roots, gain inside."""
+        find(self.views, w_o, view, weight)
+        _weigh_views(self.tables.views, view, weight)
+
+    def blocks(self, w_i, w_o):
+        """As `PairWeights.blocks`, but with weights of roots: the blend squared is the value."""
+        if self.near is not None:
+            yield from self._near_blocks(w_i, w_o)
+            return
+        n = min(len(w_i), _QUERIES)
+        pair = np.empty((n, self.most), np.int32)
+        weight = np.empty((n, self.most), np.float32)
+        index, each = np.empty((2, n, 4), np.int32), np.empty((2, n, 4))
+        for part in blocks(len(w_i), _QUERIES):
+            n = part.stop - part.start
+            self.find_lights(w_i[part], index[0, :n], each[0, :n])
+            self.find_views(w_o[part], index[1, :n], each[1, :n])
+            _combine(len(self.roots), index[:, :n], each[:, :n], pair[:n], weight[:n])
+            yield part, pair[:n], weight[:n]
+
+    def _near_blocks(self, w_i, w_o):
+        blended = np.empty(len(self.tables.importance), np.float32)
+        for part in blocks(len(w_i), _QUERIES):
+            n = part.stop - part.start
+            pair, weight = np.empty((n, self.most), np.int32), np.empty((n, self.most), np.float32)
+            self.near.find(w_i[part], w_o[part], pair, weight)
+            _weigh_pairs(
+                *self.angular, self.tables.importance, self.power, self.roots, w_i[part],
+                pair, blended, weight,
+            )  # fmt: skip
+            yield part, pair, weight
+
+
+@leaf
+def _weigh_lights(products, roots, w_i, light, weight):
+    for q in range(len(w_i)):
+        gain = np.sqrt(max(w_i[q, 2], 0.0)) * _direction_gain(products, light[q], weight[q])
+        for k in range(4):
+            weight[q, k] *= gain * roots[light[q, k]]
+
+
+@leaf
+def _weigh_views(products, view, weight):
+    for q in range(len(view)):
+        gain = _direction_gain(products, view[q], weight[q])
+        for k in range(4):
+            weight[q, k] *= gain
+
+
+@leaf
+def _combine(lights, index, each, pair, weight):
+    """Pairs of the lights and views found."""
+    one = int(np.sqrt(pair.shape[1]))
+    for q in range(len(pair)):
+        for o in range(one):
+            for i in range(one):
+                pair[q, o * one + i] = index[1, q, o] * lights + index[0, q, i]
+                weight[q, o * one + i] = each[1, q, o] * each[0, q, i]
+
+
+@leaf(fastmath={"contract", "reassoc", "nsz"})
+def _mean_square(rows, importance, pair, weight, blended):
+    """Sum over the texels of the squares of one colour's blended roots."""
+    n = rows.shape[1]
+    for k in range(n):
+        blended[k] = np.float32(0)
+    for p in range(len(pair)):
+        row = rows[pair[p]]
+        w = weight[p]
+        for k in range(n):
+            blended[k] += w * row[k]
+    total = np.float32(0)
+    for k in range(n):
+        total += importance[k] * blended[k] * blended[k]
+    return total
+
+
+@leaf
+def _weigh_pairs(first, second, third, importance, power, roots, w_i, pair, blended, weight):
+    """Turn weights of values over cosine into those of roots, in place."""
+    for q in range(len(w_i)):
+        kept = 0.0
+        for p in range(pair.shape[1]):
+            root = roots[pair[q, p]]
+            kept += weight[q, p] * root * root * power[pair[q, p]]
+            weight[q, p] *= root
+        found = _mean_square(first, importance, pair[q], weight[q], blended)
+        found += _mean_square(second, importance, pair[q], weight[q], blended)
+        found += _mean_square(third, importance, pair[q], weight[q], blended)
+        gain = np.sqrt(np.sqrt(_factor(kept, float(found)))) * np.sqrt(max(w_i[q, 2], 0.0))
+        for p in range(pair.shape[1]):
+            weight[q, p] *= gain
