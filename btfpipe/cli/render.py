@@ -66,6 +66,7 @@ def render(
       btfpipe render bunny.yaml -o bunny.exr
       btfpipe render turntable.yaml --bind model=wool.model.npz --bind map=wool.map.npz -o wool.exr
     """
+    import functools
     import time
 
     import numpy as np
@@ -74,7 +75,7 @@ def render(
     from btfpipe.formats.meshes import read_mesh
     from btfpipe.rendering.renderer import LAYERS
     from btfpipe.rendering.renderer import render as render_scene
-    from btfpipe.rendering.scene import load_scene, texture_filter_facts
+    from btfpipe.rendering.scene import load_scene, pyramids, texture_filter_facts
 
     if Path(out).suffix.lower() != ".exr":
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
@@ -91,6 +92,8 @@ def render(
         seed=seed,
     )
     refuse_inputs(out, loaded.files)
+    for pyramid in pyramids(loaded):
+        pyramid.progress = functools.partial(progress, "levels of detail", quiet)
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:

@@ -119,7 +119,7 @@ def parts_of_scene(description, film, once, read_mesh=None, read_picture=None):
         if light["type"] == "environment" and read_picture is not None:
             with naming_entry("lights", number):
                 parts.append(_map_part(light["map"], once(read_picture, light["map"])))
-    looks, shaders, levels = [], set(), set()
+    looks, shaders, levels, making = [], {}, set(), 0
     for number, entry in enumerate(description["objects"]):
         if "ground" in entry:
             continue
@@ -128,28 +128,24 @@ def parts_of_scene(description, film, once, read_mesh=None, read_picture=None):
             parts.append(mesh)
             if "model" in entry:
                 needs = once(shading_needs, entry["model"])
-                if film.texture_filter:
-                    parts.append(
-                        _levels_part(entry["model"], needs, levels, "map" in entry, number)
-                    )
                 # a patch that shows the sample itself is one piece; over a map each of three vertices may look up its own
                 looks.append((3 * layers if "map" in entry else 1, needs, "map" in entry))
                 shader = tuple(str(entry.get(k)) for k in ("model", "material", "interpolation"))
                 if shader not in shaders:
-                    parts.append(Part(entry["model"], needs.kept, needs.loading, 0, needs.instead))
-                shaders.add(shader)
+                    instead = needs.instead
+                    if film.texture_filter and not instead:
+                        instead = "--no-texture-filter"
+                    shaders[shader] = Part(entry["model"], needs.kept, needs.loading, 0, instead)
+                    parts.append(shaders[shader])
+                # levels of detail are made one after the other, once for all that shows a sample itself and once a map
+                worn = shader, *(str(entry[k]) for k in ("map", "surface", "plane") if "map" in entry and k in entry)  # fmt: skip
+                if film.texture_filter and worn not in levels:
+                    levels.add(worn)
+                    shaders[shader].rendering += needs.levels
+                    making = max(making, needs.making_levels)
+    if making:
+        parts.append(Part("making levels of detail", 0, 0, making, "--no-texture-filter"))
     return parts, _tile_bytes(film, lights, looks)
-
-
-def _levels_part(name, needs, made, mapped, number):
-    """The Part of the levels of detail of a Model, once for all that shows it by itself and once a map."""
-    key = (name, number if mapped else None)
-    size = 0 if key in made else needs.levels
-    making = 0 if key in made else needs.making_levels
-    made.add(key)
-    return Part(
-        f"levels of detail of {name}", rendering=size + making, instead="--no-texture-filter"
-    )
 
 
 def _map_part(name, picture):

@@ -10,6 +10,7 @@ display values are not: there the decoded pictures are averaged, and one SVD of 
 give the levels above.
 """
 
+import contextlib
 import copy
 import math
 import threading
@@ -23,6 +24,7 @@ from btfpipe.sample.shading import corners
 
 ERROR_BOUND = 0.04  # RMS of an SVD's error over the RMS of the averaged values; a picture averages most of it away
 _UNUSED = 0.01  # weight of a texel that a map does not use, over the mean weight
+_MAKING = threading.Lock()  # one pyramid at a time, for memory
 FIRST_TERMS, MOST_TERMS = 64, 512  # of that SVD; doubled until it is within the bound
 
 
@@ -203,6 +205,11 @@ def _splat(row, col, weight, rows, cols, toroidal, texel, share, total):
             total[texel[k] // cols, texel[k] % cols] += weight[q] * share[k]
 
 
+@contextlib.contextmanager
+def _silent():
+    yield lambda done, total: None
+
+
 class Pyramid:
     """Shaders of all levels, made when they are first asked for.
 
@@ -226,6 +233,8 @@ class Pyramid:
         Of the levels above 0, once they are made.
     seconds : float
         That making them took.
+    progress : callable
+        Gives a context manager whose ``report(done, total)`` is called while levels are made; silent by default.
     facts : dict
         ``terms`` and ``relative_error`` of the SVD, where there is one.
     """
@@ -237,7 +246,7 @@ class Pyramid:
         self.nbytes, self.seconds, self.facts = 0, 0.0, {}
         self.top = count_levels(appearance.shape) - 1
         self._levels = [shader]
-        self._lock = threading.Lock()
+        self.progress = _silent
 
     @property
     def made(self):
@@ -247,29 +256,31 @@ class Pyramid:
     def level(self, number):
         """The shader of a level, at most `top`."""
         if number and not self.made:
-            with self._lock:
+            with _MAKING:
                 if not self.made:
                     start = time.perf_counter()
-                    self._levels = self._make()
+                    with self.progress() as report:
+                        self._levels = self._make(report)
                     self.seconds = time.perf_counter() - start
         return self._levels[number]
 
-    def _make(self):
+    def _make(self, report):
         levels, weight = self._levels[:], self.weight
         toroidal = bool(self.appearance.toroidal)
-        for _ in range(self.top):
+        for number in range(self.top):
             below = levels[-1]
             halving = Halving((below.rows, below.cols), toroidal, weight)
             if hasattr(below, "halved"):
                 made = below.halved(halving)
             else:
-                made = self._factorised(halving)
+                made = self._factorised(halving, report)
             self.nbytes += _own_bytes(made, below)
             levels.append(made)
             weight = halving.weight_above
+            report(number + 1, self.top)
         return levels
 
-    def _factorised(self, halving):
+    def _factorised(self, halving, report):
         """Level 1 as an SVD of the averaged pictures."""
         from btfpipe.compression.svd import SvdModel, factorise
 
@@ -285,7 +296,7 @@ class Pyramid:
         while True:
             texture, angular, facts = factorise(
                 level, terms, rows=rows, iterations=0, precision="single", threads=self.threads,
-                memory=1 << 62,
+                memory=1 << 62, on_progress=report,
             )  # fmt: skip
             if (
                 facts["relative_error"] <= ERROR_BOUND

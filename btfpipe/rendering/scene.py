@@ -265,12 +265,17 @@ def _pyramid(pyramids, entry, thing, threads):
     return pyramids[key]
 
 
+def pyramids(scene):
+    """The levels of detail of a Scene's objects, each once."""
+    found = {id(t.dressing.pyramid): t.dressing.pyramid for t in scene.objects if t.dressing}
+    return [pyramid for pyramid in found.values() if pyramid is not None]
+
+
 def texture_filter_facts(scene):
     """What the levels of detail of a rendered Scene took: bytes, seconds, errors of those that are an SVD; warnings as sentences."""
     from btfpipe.rendering.pyramid import ERROR_BOUND
 
-    made = {id(t.dressing.pyramid): t.dressing.pyramid for t in scene.objects if t.dressing}
-    made = [pyramid for pyramid in made.values() if pyramid is not None and pyramid.made]
+    made = [pyramid for pyramid in pyramids(scene) if pyramid.made]
     facts = {
         "levels_bytes": sum(pyramid.nbytes for pyramid in made),
         "levels_seconds": round(sum(pyramid.seconds for pyramid in made), 3),
