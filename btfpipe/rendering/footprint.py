@@ -25,7 +25,7 @@ from btfpipe.hashing import uniform
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
 PROBES = 1 << 14  # evaluated at a time
 _LEAST = 0.1  # variance of a pixel, in texels squared, up to which it is a point (0.63 texels); whole from twice that on
-_SPLIT = 0.3  # variance that rays stand for, both axes, from which on strata are divided
+_SPLIT = 0.12  # variance that rays stand for, both axes, from which on strata are divided
 _TEXTURE_RATE = 3.3  # texture rays along an axis of the film for a texel a pixel
 MOST_TEXTURE_RAYS = 3  # of a ray along an axis
 _MOST_PARTS = 3  # of a stratum along each axis

@@ -41,7 +41,7 @@ def models(tmp_path_factory):
     return folder
 
 
-def plane(folder, model, texels_a_pixel, size=20, camera=None, **extra):
+def plane(folder, model, texels_a_pixel, size=16, camera=None, **extra):
     """A scene of a plane that fills the film, by default so that a pixel covers so many texels."""
     scene = {
         "camera": camera or {
@@ -76,7 +76,7 @@ def error(found, truth, inside=None):
 @pytest.mark.parametrize("model", ["svd.npz", "coded.npz"])
 def test_16_filtered_rays_are_as_good_as_very_many(models, model, texels):
     path = plane(models, model, texels)
-    truth = picture(path, 484, False, seed=7)
+    truth = picture(path, 1024, False, seed=7)
     assert error(picture(path, 16, False), truth) > 0.035
     assert error(picture(path, 16, True), truth) < 0.02
 
@@ -90,7 +90,7 @@ def test_a_plane_towards_the_horizon(models):
         "fov_deg": 30,
     }
     path = plane(models, "svd.npz", 0, camera=camera)
-    truth = picture(path, 484, False, seed=7)
+    truth = picture(path, 1024, False, seed=7)
     assert error(picture(path, 16, False), truth) > 0.04
     assert error(picture(path, 16, True), truth) < 0.02
 
@@ -102,7 +102,7 @@ def test_close_ups_keep_their_bytes(models):
 
 def test_no_blur_where_a_texel_covers_a_pixel(models):
     path = plane(models, "svd.npz", 1.0)
-    truth = picture(path, 484, False, seed=7)
+    truth = picture(path, 1024, False, seed=7)
     filtered = picture(path, 16, True)
     assert error(filtered, truth) < min(0.03, error(picture(path, 16, False), truth))
     contrast = truth[..., :3].std(axis=(0, 1))
@@ -218,7 +218,7 @@ def test_a_map_of_small_pieces(models, rng):
     scene = yaml.safe_load(path.read_text())
     scene["objects"][0]["plane"]["size"] = [0.96, 0.96]
     path.write_text(yaml.safe_dump(scene))
-    truth = picture(path, 484, False, seed=7)
+    truth = picture(path, 1024, False, seed=7)
     assert error(picture(path, 16, False), truth) > 0.06
     found = picture(path, 16, True)
     assert error(found, truth) < 0.02
