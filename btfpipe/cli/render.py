@@ -42,13 +42,20 @@ def _bindings(context, parameter, values):
     "--samples", type=click.IntRange(1, MOST_SAMPLES), help="Rays a pixel, instead of the scene's."
 )
 @click.option(
+    "--texture-filter/--no-texture-filter",
+    default=None,
+    help="Whether Samples and Models are averaged over what a ray covers of them, instead of as the scene says (by default yes).",
+)
+@click.option(
     "--float",
     "full",
     is_flag=True,
     help="Store all layers as 32-bit floats; otherwise colours, alpha and normals are 16-bit, unless radiance exceeds those.",
 )
 @stage()
-def render(scene, bindings, width, height, samples, full, out, seed, threads, memory, quiet):
+def render(
+    scene, bindings, width, height, samples, texture_filter, full, out, seed, threads, memory, quiet
+):  # fmt: skip
     """Make a picture of a scene: dressed surfaces under lights, as OpenEXR.
 
     SCENE is a YAML file with camera, film, lights and objects. Layers of the picture: colour and alpha (R G B A,
@@ -59,6 +66,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
       btfpipe render bunny.yaml -o bunny.exr
       btfpipe render turntable.yaml --bind model=wool.model.npz --bind map=wool.map.npz -o wool.exr
     """
+    import functools
     import time
 
     import numpy as np
@@ -67,11 +75,11 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
     from btfpipe.formats.meshes import read_mesh
     from btfpipe.rendering.renderer import LAYERS
     from btfpipe.rendering.renderer import render as render_scene
-    from btfpipe.rendering.scene import load_scene
+    from btfpipe.rendering.scene import load_scene, pyramids, texture_filter_facts
 
     if Path(out).suffix.lower() != ".exr":
         raise InputError(f"{out}: pictures are written as OpenEXR; end the name in .exr.")
-    film = {"width": width, "height": height, "samples": samples}
+    film = {"width": width, "height": height, "samples": samples, "texture_filter": texture_filter}
     start = time.perf_counter()
     loaded = load_scene(
         scene,
@@ -84,6 +92,8 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         seed=seed,
     )
     refuse_inputs(out, loaded.files)
+    for pyramid in pyramids(loaded):
+        pyramid.progress = functools.partial(progress, "levels of detail", quiet)
     load_seconds = time.perf_counter() - start
     start = time.perf_counter()
     with progress("render", quiet) as report:
@@ -101,6 +111,8 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         )
     half = [not full and name[0] in short for name in LAYERS]
     write_picture(out, picture, names=list(LAYERS), half=half)
+    levels = texture_filter_facts(loaded)
+    warnings += levels.pop("warnings", [])
     warn(*warnings)
     return {
         "inputs": [scene, *loaded.files],
@@ -109,6 +121,7 @@ def render(scene, bindings, width, height, samples, full, out, seed, threads, me
         "samples": loaded.film.samples,
         "load_seconds": round(load_seconds, 3),
         "render_seconds": round(render_seconds, 3),
+        "texture_filter": loaded.film.texture_filter and levels,
         "covered": float((picture[..., 3] > 0).mean()),
         "warnings": warnings,
     }

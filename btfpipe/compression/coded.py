@@ -34,7 +34,7 @@ from btfpipe.compression.svd import SvdModel, factorise, planar_codes, planar_pi
 from btfpipe.errors import InputError, too_little
 from btfpipe.metrics import raw_bytes
 from btfpipe.parallel import blocks, ordered_map, single_threaded_blas
-from btfpipe.sample.appearance import ShadingNeeds
+from btfpipe.sample.appearance import ShadingNeeds, svd_levels
 from btfpipe.sample.transfer import decode_table
 
 _TERMS = 256
@@ -135,7 +135,8 @@ class CodedModel(Model):
             shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
         # each is unpacked into one array and laid out anew in another
         products = 20 * math.prod(shape)
-        return ShadingNeeds(texture + angular + products, max(texture, angular), *shared)
+        levels = svd_levels(math.prod(shape), len(source.light_index))
+        return ShadingNeeds(texture + angular + products, max(texture, angular), *shared, **levels)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.coded_shading import CodedShader

@@ -5,13 +5,15 @@ number of terms: luminance gets more than colour. Several of the spaces are loga
 relative to the value.
 """
 
+import math
+
 import numpy as np
 
 from btfpipe.compiled import leaf, njit
 from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise, left_out, pictures_to_read, planar_pictures
 from btfpipe.errors import InputError
-from btfpipe.sample.appearance import ShadingNeeds
+from btfpipe.sample.appearance import ShadingNeeds, svd_levels
 
 EPSILON = 1e-5  # added inside logarithms by the ``.btf`` formats
 _MOST_CHROMA = 4.0  # of |U| / Y and |V| / Y; colours without negative channels stay below 3.83
@@ -201,7 +203,10 @@ class FactoredModel(Model):
             name = f"texture_{c}" if f"texture_{c}" in reader else "texture_0"
             factors.append(reader.require(name, (None,) * 3, "f", finite=False))
             factors.append(reader.require(f"angular_{c}", (None,) * 2, "f", finite=False))
-        return ShadingNeeds(4 * sum(f.size for f in factors), max(f.size for f in factors))
+        levels = svd_levels(math.prod(factors[0].shape[:2]), len(factors[1]))
+        return ShadingNeeds(
+            4 * sum(f.size for f in factors), max(f.size for f in factors), **levels
+        )
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.factored_shading import FactoredShader

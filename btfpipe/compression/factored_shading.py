@@ -37,6 +37,13 @@ class FactoredShader(PairShader):
         )  # fmt: skip
         self.kernel = _shade_linear if model.is_linear else _shade
 
+    @property
+    def halved(self):
+        """Makes the shader of the next level of a `Pyramid`; not there where texels cannot be averaged before decoding."""
+        if self.kernel is not _shade_linear:
+            raise AttributeError("halved")
+        return lambda halving: halving.coarser(self, texture=halving(self.texture))
+
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
         for part, pair, share in self.pairs.blocks(w_i, w_o):

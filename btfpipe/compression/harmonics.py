@@ -130,7 +130,12 @@ class HarmonicsModel(Model):
         from btfpipe.compression.harmonics_shading import MANY_LIGHTS, slice_bytes
 
         codes = reader.require("codes", (None,) * 5, "u")  # stay mapped
-        return ShadingNeeds(slice_bytes=slice_bytes(codes.shape[4]), many_lights=MANY_LIGHTS)
+        return ShadingNeeds(
+            slice_bytes=slice_bytes(codes.shape[4]),
+            many_lights=MANY_LIGHTS,
+            levels=2 * codes.size // 3,
+            making_levels=codes.size,
+        )
 
     def shader(self, interpolation="barycentric"):
         """As `Appearance.shader`, but straight from the harmonics: `interpolation` changes nothing."""

@@ -19,6 +19,7 @@ from btfpipe.sample.shading import corners
 
 FAST = {"contract", "reassoc", "nsz"}
 MANY_LIGHTS = 2
+_FINER = 257  # codes of 16 bits to one of 8
 
 
 class HarmonicsShader:
@@ -30,6 +31,7 @@ class HarmonicsShader:
     """
 
     many_lights = MANY_LIGHTS
+    linear_slices = True  # may be averaged
 
     def __init__(self, model):
         self.rows, self.cols = model.shape
@@ -44,6 +46,15 @@ class HarmonicsShader:
         self.least_view, self.least_light = (
             least_cosine(d) for d in (model.view_directions, model.light_directions)
         )
+
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`: codes of 16 bits, as means of codes lie between them."""
+        codes, scale = halving(self.codes), 1
+        if self.codes.dtype == np.uint8:
+            scale = _FINER
+            codes *= np.float32(scale)
+        codes = np.rint(codes, out=codes).astype(np.uint16)
+        return halving.coarser(self, codes=codes, step=self.step / np.float32(scale))
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -74,15 +85,15 @@ class HarmonicSlices:
 
     def __init__(self, shader, row, col, w_o):
         self.table, self.least = shader.light_table, shader.least_light
-        self.coefficients = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
+        self.values = np.empty((len(row), 3, self.table.shape[0] ** 2), np.float32)
         _slice(
             shader.codes, shader.minimum, shader.step, shader.view_table, shader.least_view,
-            shader.rows, shader.cols, shader.toroidal, row, col, w_o, self.coefficients,
+            shader.rows, shader.cols, shader.toroidal, row, col, w_o, self.values,
         )  # fmt: skip
 
     def shade(self, chosen, w_i, out):
         """Fill `out`; see `Appearance.shader`."""
-        _sum(self.coefficients, self.table, self.least, chosen, w_i, out)
+        _sum(self.values, self.table, self.least, chosen, w_i, out)
 
 
 def least_cosine(directions):

@@ -25,7 +25,7 @@ from btfpipe.compression.model import Model, measured_error
 from btfpipe.compression.svd import factorise
 from btfpipe.errors import InputError, naming
 from btfpipe.parallel import blocks, single_threaded_blas
-from btfpipe.sample.appearance import ShadingNeeds
+from btfpipe.sample.appearance import ShadingNeeds, svd_levels
 from btfpipe.sample.resample import Resampled
 
 # Of the pictures' 3 bytes a texel and pair, by default one in so many is spent: with 8 components in half precision
@@ -211,7 +211,7 @@ class LocalPcaModel(Model):
         bases = reader.require("bases", (None,) * 4, "fi", finite=False)
         coordinates = reader.require("coordinates", (None,) * 2, "f", finite=False)
         kept = 4 * (bases.size + coordinates.size + len(coordinates))
-        return ShadingNeeds(kept, bases.size)
+        return ShadingNeeds(kept, bases.size, **svd_levels(len(coordinates), bases.shape[1]))
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.local_shading import LocalPcaShader

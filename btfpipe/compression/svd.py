@@ -89,7 +89,7 @@ class SvdModel(Model):
         factors = [reader.require(name, (None,) * 3, "f", finite=False) for name in names]
         # single precision stays mapped
         kept = sum(4 * f.size for f in factors if f.dtype != np.float32)
-        return ShadingNeeds(kept, max(f.size for f in factors))
+        return ShadingNeeds(kept, max(f.size for f in factors), levels=2 * factors[0].size)
 
     def shader(self, interpolation="barycentric"):
         from btfpipe.compression.svd_shading import SvdShader

@@ -105,7 +105,8 @@ class ViewPcaModel(Model):
         weights = reader.require("weights", (None,) * 3, "f", finite=False)
         kept = 4 * (means.size + textures.size + weights.size)
         # while values are checked, then a view in single precision
-        return ShadingNeeds(kept, max(textures.size, 2 * kept // max(len(means), 1)))
+        loading = max(textures.size, 2 * kept // max(len(means), 1))
+        return ShadingNeeds(kept, loading, levels=2 * (means.size + textures.size))
 
     def shader(self, interpolation="barycentric"):
         return ViewPcaShader(self, interpolation)
@@ -331,6 +332,10 @@ class ViewPcaShader(PairShader):
             self.textures[:, view] = model.terms(view).swapaxes(0, 1).reshape(-1, 3 * terms)
         self.weights = np.ascontiguousarray(model.weights, np.float32).reshape(-1, terms)
         self.lights = model.weights.shape[1]
+
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`."""
+        return halving.coarser(self, textures=halving(self.textures))
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""

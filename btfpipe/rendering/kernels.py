@@ -283,7 +283,7 @@ def _interpolated(layer, f, i, h, share, faces, row, col, rows, cols, toroidal):
 @njit(cache=True, nogil=True)
 def gather_lookups(
     lit, face, share, normal, facing, toward_eye, w_i, faces, row, col, weight, axis, coherent,
-    rows, cols, toroidal, at_row, at_col, at_i, at_o, blend, target,
+    rows, cols, toroidal, at_row, at_col, at_i, at_o, blend, target, corner,
 ):  # fmt: skip
     """List the texel coordinates, lights and views that the points `lit` of one dressed object need.
 
@@ -299,8 +299,9 @@ def gather_lookups(
         As `surface_points` fills them; directions in the scene's frame.
     faces, row, col, weight, axis, coherent
         The object's; see `Dressing`.
-    at_row, at_col, at_i, at_o, blend, target
-        Filled in place: arguments of ``shade``, the share of each lookup, and its point.
+    at_row, at_col, at_i, at_o, blend, target, corner
+        Filled in place: arguments of ``shade``, the share of each lookup, its point, and the corner of the face that it is of,
+        or -1 between all three.
 
     Returns
     -------
@@ -368,6 +369,7 @@ def gather_lookups(
                 )
                 blend[count] = w
                 target[count] = h
+                corner[count] = -1 if one else k
                 count += 1
     return count
 

@@ -12,11 +12,14 @@ from btfpipe.errors import InputError, amount
 from btfpipe.rendering import objects
 from btfpipe.rendering.description import naming_entry
 from btfpipe.rendering.environment import KEPT_PIXEL_BYTES, PIXEL_BYTES
+from btfpipe.rendering.footprint import MOST_TEXTURE_RAYS, PROBES
 from btfpipe.rendering.renderer import LAYERS, tile_side
 
 PROCESS_BYTES = 120 << 20  # Python, its libraries and compiled kernels
 _RAY_BYTES = 530  # origin, direction, hit, point, light
 _LOOKUP_BYTES = 80  # coordinates, directions and values
+_FOOTPRINT_BYTES = 130  # of a look-up that is filtered: its strata's parts
+_PROBE_BYTES = 150  # of those evaluated at a time
 _SLICED_BYTES = 150  # of a look-up with a slice, beside the slice
 _OCCLUSION_BYTES = 48  # a ray of those that see how much of the sky is open
 _TILE_PIXEL_BYTES = 200  # sums and layers of a tile, and of finished tiles that wait for their turn
@@ -116,7 +119,7 @@ def parts_of_scene(description, film, once, read_mesh=None, read_picture=None):
         if light["type"] == "environment" and read_picture is not None:
             with naming_entry("lights", number):
                 parts.append(_map_part(light["map"], once(read_picture, light["map"])))
-    looks, shaders = [], set()
+    looks, shaders, levels, making = [], {}, set(), 0
     for number, entry in enumerate(description["objects"]):
         if "ground" in entry:
             continue
@@ -126,11 +129,22 @@ def parts_of_scene(description, film, once, read_mesh=None, read_picture=None):
             if "model" in entry:
                 needs = once(shading_needs, entry["model"])
                 # a patch that shows the sample itself is one piece; over a map each of three vertices may look up its own
-                looks.append((3 * layers if "map" in entry else 1, needs))
+                looks.append((3 * layers if "map" in entry else 1, needs, "map" in entry))
                 shader = tuple(str(entry.get(k)) for k in ("model", "material", "interpolation"))
                 if shader not in shaders:
-                    parts.append(Part(entry["model"], needs.kept, needs.loading, 0, needs.instead))
-                shaders.add(shader)
+                    instead = needs.instead
+                    if film.texture_filter and not instead:
+                        instead = "--no-texture-filter"
+                    shaders[shader] = Part(entry["model"], needs.kept, needs.loading, 0, instead)
+                    parts.append(shaders[shader])
+                # levels of detail are made one after the other, once for all that shows a sample itself and once a map
+                worn = shader, *(str(entry[k]) for k in ("map", "surface", "plane") if "map" in entry and k in entry)  # fmt: skip
+                if film.texture_filter and worn not in levels:
+                    levels.add(worn)
+                    shaders[shader].rendering += needs.levels
+                    making = max(making, needs.making_levels)
+    if making:
+        parts.append(Part("making levels of detail", 0, 0, making, "--no-texture-filter"))
     return parts, _tile_bytes(film, lights, looks)
 
 
@@ -185,22 +199,30 @@ def _tile_bytes(film, lights, looks):
     skies = [
         light.get("occlusion_rays", 16) for light in lights if light.get("method") == "harmonics"
     ]
+    # each ray of a map's may become so many more; fewer of them share a tile
+    mapped = film.texture_filter and any(m for _, _, m in looks)
+    more = MOST_TEXTURE_RAYS**2 if mapped else 1
+    looks = [(n * (more if m else 1), needs) for n, needs, m in looks]
     sliced = [
         (n, needs.slice_bytes)
         for n, needs in looks
         if needs.slice_bytes and count >= needs.many_lights
     ]
     most = max((size for _, size in sliced), default=0)
-    ray = _RAY_BYTES + _OCCLUSION_BYTES * max(skies, default=0)
-    plain = ray + _LOOKUP_BYTES * max((n for n, _ in looks), default=1)
-    shared = ray + max(
-        (n * (_LOOKUP_BYTES + _SLICED_BYTES + size) for n, size in sliced), default=0
-    )
+    ray = _RAY_BYTES * (1 + (more > 1) * more // 2) + _OCCLUSION_BYTES * max(skies, default=0)
+    lookup, fixed = _LOOKUP_BYTES, 0
+    if film.texture_filter and looks:
+        lookup, fixed = _LOOKUP_BYTES + _FOOTPRINT_BYTES, _PROBE_BYTES * PROBES
+        fixed += most * PROBES
+    plain = ray + lookup * max((n for n, _ in looks), default=1)
+    shared = ray + max((n * (lookup + _SLICED_BYTES + size) for n, size in sliced), default=0)
     # slices make tiles smaller, if there are any in the end
-    return max(_tile_of(film, 0, plain), _tile_of(film, most, max(plain, shared)))
+    return fixed + max(
+        _tile_of(film, 0, plain, mapped), _tile_of(film, most, max(plain, shared), mapped)
+    )
 
 
-def _tile_of(film, slice_bytes, ray_bytes):
-    side = tile_side(film.samples, slice_bytes)
+def _tile_of(film, slice_bytes, ray_bytes, mapped):
+    side = tile_side(film.samples, slice_bytes, mapped)
     pixels = min(side, film.width) * min(side, film.height)
     return pixels * (film.samples * ray_bytes + _TILE_PIXEL_BYTES)

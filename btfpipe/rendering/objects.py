@@ -29,6 +29,12 @@ class Dressing:
     toroidal : bool
     model : Appearance
         What the shader evaluates.
+    texels_per_unit : float
+        Texels per unit of length of the scene.
+    mapped : bool
+        Whether the coordinates are a map's, with borders between pieces of the sample.
+    pyramid : Pyramid or None
+        Levels of detail; None if look-ups are not filtered.
     skies : dict
         `HarmonicEnvironment` by the number of the environment, which then lights this surface instead of its directional lights.
     """
@@ -43,6 +49,9 @@ class Dressing:
     cols: int
     toroidal: bool
     model: object = None
+    texels_per_unit: float = 1.0
+    mapped: bool = False
+    pyramid: object = None
     skies: dict = field(default_factory=dict)
 
 
@@ -146,7 +155,7 @@ def dress(vertices, faces, normals, tangents, coordinates, appearance, interpola
         )  # fmt: skip
     return Dressing(
         row, col, weight, axis, coherent, _shader(appearance, interpolation), rows, cols,
-        bool(appearance.toroidal), appearance,
+        bool(appearance.toroidal), appearance, float(coordinates.texels_per_unit),
     )  # fmt: skip
 
 
@@ -290,6 +299,7 @@ def transformed(thing, transform):
     thing.normals = np.ascontiguousarray(thing.normals @ turn.T, np.float32)
     if thing.dressing is not None:
         thing.dressing.axis = np.ascontiguousarray(thing.dressing.axis @ turn.T, np.float32)
+        thing.dressing.texels_per_unit /= transform.get("scale", 1)
     return thing
 
 

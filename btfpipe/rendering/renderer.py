@@ -5,16 +5,28 @@ import numpy as np
 from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
+from btfpipe.rendering.footprint import (
+    Footprints,
+    count_texture_rays,
+    film_offsets,
+    film_steps,
+    filter_variance,
+    strata_parts,
+    texture_rays,
+)
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
+TEXTURE_TILES = 8  # so many tiles in the place of one if objects wear maps that are filtered
 # of a tile; fixed, so that memory is bounded and tiles are the same for any number of threads
 _RAYS = 1 << 16
 _RAY_BYTES = 600  # about what a ray takes, for tiles of like size in memory; fixed, too
 
 
-def tile_side(samples, slice_bytes=0):
-    """Pixels along a tile's side at this many rays a pixel; smaller if a ray's look-up keeps so many bytes of a slice."""
+def tile_side(samples, slice_bytes=0, texture_rays=False):
+    """Pixels along a tile's side at this many rays a pixel; smaller for look-ups with so many bytes of a slice, or texture rays."""
     rays = _RAYS * _RAY_BYTES / (_RAY_BYTES + slice_bytes)
+    if texture_rays:
+        rays /= TEXTURE_TILES
     return min(max(int(np.sqrt(rays / samples)), 8), 256)
 
 
@@ -25,6 +37,13 @@ def _is_sliced(thing, lights):
     many = getattr(thing.dressing.shader, "many_lights", None)
     lights = [light for light in lights if light.environment not in thing.dressing.skies]
     return many is not None and len(lights) >= many
+
+
+def _of_points(target, chosen, n):
+    """Which look-ups, by their points `target`, are of some of the n points."""
+    wanted = np.zeros(n, bool)
+    wanted[chosen] = True
+    return np.flatnonzero(wanted[target])
 
 
 class Renderer:
@@ -56,6 +75,8 @@ class Renderer:
             if _is_sliced(thing, scene.lights)
         }
         self.table = filter_table(scene.film.filter, scene.film.radius)
+        rows, cols = strata(scene.film.samples)
+        self.parts = strata_parts(self.table, cols), strata_parts(self.table, rows)
         self.tree = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self.tree, self.vertices.astype(np.float32), self.faces)
         ray = np.zeros((1, 3), np.float32)
@@ -65,7 +86,9 @@ class Renderer:
         """Rectangles (x, y, width, height) that cover the film."""
         film = self.scene.film
         most = max((shader.slice_bytes for shader in self.sliced.values()), default=0)
-        side = tile_side(film.samples, most)
+        dressings = [thing.dressing for thing in self.scene.objects if thing.dressing is not None]
+        mapped = any(d.mapped and d.pyramid is not None for d in dressings)
+        side = tile_side(film.samples, most, mapped)
         return [
             (x, y, min(side, film.width - x), min(side, film.height - y))
             for y in range(0, film.height, side)
@@ -91,6 +114,8 @@ class Renderer:
         points.pixels = (
             (y + pixel // width) * film.width + x + pixel % width
         ) * film.samples + sample
+        points.fine = self._texture_points(points, found["primID"], directions)
+        points.footprints = self._footprints(points, found["primID"], directions)
         radiance = np.zeros((len(hits), 3))
         if len(hits):
             slices = {number: self._slice(number, points) for number in self.sliced}
@@ -98,7 +123,7 @@ class Renderer:
                 self._add_light(light, points, slices, radiance)
             for number, thing in enumerate(self.scene.objects):
                 if thing.dressing is not None and thing.dressing.skies:
-                    self._add_skies(thing, np.flatnonzero(points.thing == number), points, radiance)
+                    self._add_skies(number, points, radiance)
         picture = np.empty((width * height, len(LAYERS)))
         # depth along the camera's axis, as compositing programs expect it
         depth = points.depth * (directions[hits] @ camera.axes[2])
@@ -129,7 +154,10 @@ class Renderer:
         """Slices of all look-ups of an object, and the point of each."""
         thing = self.scene.objects[number]
         mine = np.flatnonzero(points.thing == number)
-        row, col, _, at_o, _, target = self._look_up(thing, mine, points, points.toward_eye)
+        row, col, _, at_o, _, target, _ = self._look_up(thing, mine, points, points.toward_eye)
+        filtered = points.footprints[number]
+        if filtered is not None:
+            return (filtered.slices(at_o), target) if filtered.linear_slices else None
         return self.sliced[number].slices(row, col, at_o), target
 
     def _add_light(self, light, points, slices, radiance):
@@ -151,19 +179,22 @@ class Renderer:
                 kernels.add_diffuse(mine, thing.albedo, points.normal, w_i, irradiance, radiance)
             elif len(mine) and light.environment not in thing.dressing.skies:
                 lookups = self._look_up(thing, mine, points, w_i)
-                row, col, at_i, at_o, blend, target = lookups
+                row, col, at_i, at_o, blend, target, _ = lookups
                 values = np.empty_like(at_i)
-                if number in slices:
+                filtered = points.footprints[number]
+                if slices.get(number) is not None:
                     sliced, belongs = slices[number]
-                    wanted = np.zeros(n, bool)
-                    wanted[mine] = True
-                    sliced.shade(np.flatnonzero(wanted[belongs]), at_i, values)
+                    sliced.shade(_of_points(belongs, mine, n), at_i, values)
+                elif filtered is not None:
+                    filtered.shade(_of_points(filtered.target, mine, n), at_i, at_o, values)
                 else:
                     thing.dressing.shader.shade(row, col, at_i, at_o, values)
                 kernels.add_lookups(values, blend, target, irradiance, radiance)
 
-    def _add_skies(self, thing, mine, points, radiance):
+    def _add_skies(self, number, points, radiance):
         """Add the light of environments that one object takes in the frequency domain."""
+        thing, filtered = self.scene.objects[number], points.footprints[number]
+        mine = np.flatnonzero(points.thing == number)
         if not len(mine):
             return
         n = len(points.hits)
@@ -171,7 +202,7 @@ class Renderer:
         frames = []
         for axis in np.eye(3):
             along = np.ascontiguousarray(np.broadcast_to(axis, (n, 3)))
-            row, col, at_i, at_o, blend, target = self._look_up(thing, mine, points, along)
+            row, col, at_i, at_o, blend, target, _ = self._look_up(thing, mine, points, along)
             frames.append(at_i)
         frames = np.ascontiguousarray(np.stack(frames, axis=2))
         values, full = np.empty_like(at_o), np.full((n, 3), np.pi)
@@ -179,7 +210,10 @@ class Renderer:
             visibility = np.ones(n, np.float32)
             if sky.occlusion_rays:
                 visibility[mine] = self._open_share(points, mine, sky.occlusion_rays)
-            sky.shade(row, col, frames, at_o, values, visibility[target])
+            if filtered is not None:
+                filtered.shade_sky(sky, frames, at_o, values, visibility[target])
+            else:
+                sky.shade(row, col, frames, at_o, values, visibility[target])
             kernels.add_lookups(values, blend, target, full, radiance)
 
     def _open_share(self, points, mine, rays):
@@ -194,18 +228,135 @@ class Renderer:
         return 1 - blocked.reshape(-1, rays).mean(axis=1, dtype=np.float32)
 
     def _look_up(self, thing, lit, points, w_i):
-        """Coordinates, light and view in the sample's frame, share and point of the look-ups that points of an object need."""
+        """Coordinates, light and view in the sample's frame, share, point and corner of the look-ups that points of an object need."""
         dress = thing.dressing
-        n = kernels.count_lookups(lit, points.face, dress.weight, dress.coherent)
+        fine = points.fine.get(id(thing))
+        seen = points
+        if fine is not None:
+            lit, seen, w_i = _of_points(fine.parent, lit, len(points.hits)), fine, w_i[fine.parent]
+        n = kernels.count_lookups(lit, seen.face, dress.weight, dress.coherent)
         row, col, blend = (np.empty(n, np.float32) for _ in range(3))
         at_i, at_o = (np.empty((n, 3), np.float32) for _ in range(2))
-        target = np.empty(n, np.int64)
+        target, corner = np.empty(n, np.int64), np.empty(n, np.int8)
         n = kernels.gather_lookups(
-            lit, points.face, points.share, points.normal, points.facing, points.toward_eye, w_i,
+            lit, seen.face, seen.share, seen.normal, seen.facing, seen.toward_eye, w_i,
             thing.faces, dress.row, dress.col, dress.weight, dress.axis, dress.coherent,
-            dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target,
+            dress.rows, dress.cols, dress.toroidal, row, col, at_i, at_o, blend, target, corner,
         )  # fmt: skip
-        return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target))
+        if fine is not None:
+            blend[:n] *= fine.weight[target[:n]]
+            target[:n] = fine.parent[target[:n]]
+        return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target, corner))
+
+    def _steps(self, points, prim, directions):
+        """Steps on the tangent planes of points; see `footprint.film_steps`."""
+        film, camera = self.scene.film, self.scene.camera
+        over = np.empty((len(points.hits), 3)), np.empty((len(points.hits), 3))
+        film_steps(
+            points.hits, prim, directions, points.depth, self.vertices, self.faces, camera.axes,
+            2 * camera.extent[0] / film.width, -2 * camera.extent[1] / film.height, camera.perspective,
+            *over,
+        )  # fmt: skip
+        return over
+
+    def _texture_points(self, points, prim, directions):
+        """The `Points` at which mapped objects are looked up, by the identity of the object, where they are others than its own.
+
+        A map's neighbouring texels are not the sample's: what a ray covers of it is found by further rays, without shadows of
+        their own, until these are about half a texel apart.
+        """
+        n, found = len(points.hits), {}
+        mapped = [
+            number for number, thing in enumerate(self.scene.objects)
+            if thing.dressing is not None and thing.dressing.pyramid is not None and thing.dressing.mapped
+        ]  # fmt: skip
+        if not mapped or not n:
+            return found
+        film, camera = self.scene.film, self.scene.camera
+        rows, cols = strata(film.samples)
+        over = self._steps(points, prim, directions)
+        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
+        film_offsets(points.pixels, rows, cols, self.table, self.seed, offset, stratum)
+        for number in mapped:
+            thing = self.scene.objects[number]
+            mine = np.flatnonzero(points.thing == number)
+            across, down = np.empty(len(mine), np.int64), np.empty(len(mine), np.int64)
+            count = count_texture_rays(
+                mine, *over, float(thing.dressing.texels_per_unit), rows, cols, across, down
+            )
+            if count == len(mine):
+                continue
+            parent = np.empty(count, np.int64)
+            origins, toward = np.empty((count, 3)), np.empty((count, 3))
+            texture_rays(
+                points.pixels, mine, across, down, rows, cols, film.width, film.height, self.table,
+                camera.position, camera.axes, np.array(camera.extent), camera.perspective, offset, parent,
+                origins, toward,
+            )  # fmt: skip
+            hit = self.tree.run(origins.astype(np.float32), toward.astype(np.float32), output=1)[
+                "primID"
+            ]
+            first, last = self.first_face[number], self.first_face[number + 1]
+            good = (hit >= first) & (hit < last)
+            # where none meets the object, the point's own ray does
+            lost = np.flatnonzero(np.bincount(parent[good], minlength=n)[mine] == 0)
+            if len(lost):
+                starts = np.cumsum(across * down) - across * down
+                at = starts[lost]
+                own = points.hits[mine[lost]]
+                toward[at], hit[at], good[at] = directions[own], prim[own], True
+                origins[at] = points.point[mine[lost]] - toward[at]
+            fine = Points(self, np.flatnonzero(good), hit, origins, toward)
+            fine.parent = parent[good]
+            fine.weight = (1 / np.bincount(fine.parent, minlength=n)[fine.parent]).astype(
+                np.float32
+            )
+            fine.over = self._steps(fine, hit, toward)
+            place = np.searchsorted(mine, fine.parent)
+            fine.over = fine.over[0] / across[place, None], fine.over[1] / down[place, None]
+            found[id(thing)] = fine
+        return found
+
+    def _footprints(self, points, prim, directions):
+        """The `Footprints` of each object's look-ups at all its points; None where nothing is filtered."""
+        found = [None] * len(self.scene.objects)
+        filtered = [
+            number
+            for number, thing in enumerate(self.scene.objects)
+            if thing.dressing is not None and thing.dressing.pyramid is not None
+        ]
+        if not filtered or not len(points.hits):
+            return found
+        n = len(points.hits)
+        over = self._steps(points, prim, directions)
+        rows, cols = strata(self.scene.film.samples)
+        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
+        film_offsets(points.pixels, rows, cols, self.table, self.seed, offset, stratum)
+        for number in filtered:
+            thing = self.scene.objects[number]
+            mine = np.flatnonzero(points.thing == number)
+            fine = points.fine.get(id(thing))
+            steps = over if fine is None else self._of_parents(fine, n)
+            row, col, at_x, _, _, target, corner = self._look_up(thing, mine, points, steps[0])
+            at_y = self._look_up(thing, mine, points, steps[1])[2]
+            if fine is not None:
+                corner[:] = np.maximum(corner, 0)  # texture rays are where they should be
+            made = Footprints(
+                thing.dressing.pyramid, row, col, target, corner, at_x, at_y,
+                thing.dressing.texels_per_unit, offset, stratum, self.parts,
+                filter_variance(self.table),
+            )  # fmt: skip
+            if not made.points:
+                found[number] = made
+        return found
+
+    @staticmethod
+    def _of_parents(fine, n):
+        """The steps of texture rays, of one of each point's."""
+        steps = np.zeros((n, 3)), np.zeros((n, 3))
+        for out, over in zip(steps, fine.over, strict=True):
+            out[fine.parent] = over
+        return steps
 
 
 class Points:

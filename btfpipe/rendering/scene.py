@@ -15,13 +15,14 @@ from btfpipe.rendering.memory import parts_of_scene, plan_threads
 
 @dataclass
 class Film:
-    """Pixels across and down, rays a pixel, and the filter that gathers them (radius in pixels)."""
+    """Pixels across and down, rays a pixel, the filter that gathers them (radius in pixels), and whether textures are filtered."""
 
     width: int = 512
     height: int = 512
     samples: int = 16
     filter: str = "gaussian"
     radius: float = 1.5
+    texture_filter: bool = True
 
 
 @dataclass
@@ -112,7 +113,9 @@ def load_scene(
         camera is inside an object.
     """
     description = read_description(path, bindings)
-    settings = description.get("film", {}) | {k: v for k, v in (film or {}).items() if v}
+    settings = description.get("film", {}) | {
+        k: v for k, v in (film or {}).items() if v is not None
+    }
     settings.setdefault("filter", "gaussian")
     settings.setdefault("radius", FILTER_RADIUS[settings["filter"]])
     film = Film(**settings)
@@ -129,7 +132,7 @@ def load_scene(
             parts = parts_of_scene(description, film, once, read_mesh, read_picture)
             threads = plan_threads(*parts, threads, memory)
         lights, environments, skies = [], [], {}
-        things, grounds, files = [], [], []
+        things, grounds, files, pyramids = [], [], [], {}
         for number, light in enumerate(description["lights"]):
             if light["type"] == "environment":
                 files.append(light["map"])
@@ -154,6 +157,10 @@ def load_scene(
             with naming_entry("objects", number):
                 thing = _thing(entry, once, read_mesh)
                 things.append(objects.transformed(thing, entry.get("transform")))
+                if thing.dressing is not None:
+                    thing.dressing.mapped = "map" in entry
+                if film.texture_filter and thing.dressing is not None:
+                    thing.dressing.pyramid = _pyramid(pyramids, entry, thing, threads)
         for number, sky in skies.items():
             with naming_entry("lights", number):
                 _add_sky(things, *sky)
@@ -239,6 +246,48 @@ def _add_sky(things, number, environment, light):
 def _material(once, entry):
     appearance = once(open_appearance, entry["model"])
     return once(choose_material, appearance, entry.get("material"), entry["model"])
+
+
+def _pyramid(pyramids, entry, thing, threads):
+    """Levels of detail of what an object wears; objects of one Model share them, those with a map of their own do not."""
+    from btfpipe.rendering.pyramid import Pyramid, usage
+
+    dressing = thing.dressing
+    key = (id(dressing.shader), entry.get("map"), entry.get("surface"), str(entry.get("plane")))
+    if "map" not in entry:
+        key = id(dressing.shader)
+    if key not in pyramids:
+        weight = usage(thing) if "map" in entry else None
+        interpolation = entry.get("interpolation", "barycentric")
+        pyramids[key] = Pyramid(
+            dressing.model, dressing.shader, interpolation, weight=weight, name=entry["model"], threads=threads
+        )  # fmt: skip
+    return pyramids[key]
+
+
+def pyramids(scene):
+    """The levels of detail of a Scene's objects, each once."""
+    found = {id(t.dressing.pyramid): t.dressing.pyramid for t in scene.objects if t.dressing}
+    return [pyramid for pyramid in found.values() if pyramid is not None]
+
+
+def texture_filter_facts(scene):
+    """What the levels of detail of a rendered Scene took: bytes, seconds, errors of those that are an SVD; warnings as sentences."""
+    from btfpipe.rendering.pyramid import ERROR_BOUND
+
+    made = [pyramid for pyramid in pyramids(scene) if pyramid.made]
+    facts = {
+        "levels_bytes": sum(pyramid.nbytes for pyramid in made),
+        "levels_seconds": round(sum(pyramid.seconds for pyramid in made), 3),
+        "levels_of": [{"model": str(p.name), "levels": p.top, "bytes": p.nbytes, **p.facts} for p in made],
+        "warnings": [
+            f"{p.name}: its levels of detail are off by {100 * p.facts['relative_error']:.2g} % of the averaged texels with"
+            f" {p.facts['terms']} terms; expected at most {100 * ERROR_BOUND:g} %. --no-texture-filter does without them"
+            for p in made
+            if p.facts.get("relative_error", 0) > ERROR_BOUND
+        ],
+    }  # fmt: skip
+    return facts
 
 
 def _thing(entry, once, read_mesh):

@@ -11,10 +11,22 @@ import numpy as np
 from btfpipe.errors import InputError
 
 # Private bytes of shading: kept by the shader with what it stands on, further ones while that is opened and made, and those of
-# a look-up's slice from so many lights on (see `Appearance.shader`). And what would take less, if there is something.
+# a look-up's slice from so many lights on (see `Appearance.shader`). What would take less, if there is something. And bytes of the
+# levels of detail, kept and while they are made.
 ShadingNeeds = namedtuple(
-    "ShadingNeeds", "kept loading slice_bytes many_lights instead", defaults=(0, 0, 0, 0, "")
+    "ShadingNeeds",
+    "kept loading slice_bytes many_lights instead levels making_levels",
+    defaults=(0, 0, 0, 0, "", 0, 0),
 )
+
+
+def svd_levels(texels, pairs):
+    """Bytes of levels of detail that are an SVD of averaged pictures, as keywords of `ShadingNeeds`."""
+    terms = min(512, texels // 4 + 1, 3 * pairs)
+    vectors = 4 * terms * (texels // 4 + 1)
+    kept = 4 * terms * (texels // 3 + 1 + 3 * pairs)
+    # more vectors, sums over pictures, weights in double precision, and pictures being averaged
+    return {"levels": kept, "making_levels": 6 * vectors + 24 * terms * pairs + 300 * texels}
 
 
 def light_cosines(light_directions):

@@ -185,6 +185,8 @@ class Sample(Appearance):
         codes = reader.require("pictures", (None,) * 4, finite=False)
         return ShadingNeeds(
             codes.nbytes,
+            levels=(4 if codes.dtype == np.float32 else 2) * codes.size // 3,
+            making_levels=0 if codes.dtype == np.float32 else codes.size,
             instead="a Model in the sample's place: `btfpipe compress` makes one that takes far less",
         )
 

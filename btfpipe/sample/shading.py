@@ -1,6 +1,7 @@
 """Shading straight from a Sample, and the interpolation weights that shaders share."""
 
 import functools
+import math
 import os
 
 import numpy as np
@@ -14,8 +15,10 @@ from btfpipe.directions.pairs import NearestPairs
 from btfpipe.errors import InputError
 from btfpipe.parallel import blocks
 from btfpipe.sample.appearance import light_cosines
+from btfpipe.sample.transfer import decode_table
 
 _QUERIES = 8192  # whose pairs are listed at a time
+_CHANNELS = 3 << 8  # of pairs, decoded at a time
 _BLOCK = 64  # texels whose pairs are gathered together: a line of the cache is then read once
 
 
@@ -61,6 +64,24 @@ class RawShader(PairShader):
         if sample.gain is not None:
             self.gain = np.ascontiguousarray(sample.gain, np.float32).reshape(-1, 3)
 
+    def halved(self, halving):
+        """The shader of the next level of a `Pyramid`: in half precision, of single-precision samples in single."""
+        single = self.codes.dtype == np.float32
+        codes = np.empty((math.prod(halving.halved), self.codes.shape[1]), np.float32)
+        for part in blocks(self.codes.shape[1], _CHANNELS):
+            values = self.codes[:, part]
+            values = values * self.table[0] if single else self.table[values]
+            if len(self.gain):
+                values = values * np.tile(self.gain, (values.shape[1] // 3,))
+            codes[:, part] = halving(values)
+        table = np.ones(1, np.float32)
+        if not single:
+            scale = np.float32(np.abs(codes).max(initial=1e-30))
+            codes /= scale
+            codes = codes.astype(np.float16).view(np.uint16)
+            table = decode_table(np.float16, "linear", scale)
+        return halving.coarser(self, codes=codes, table=table, gain=self.gain[:0])
+
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
         for part, pair, share in self.pairs.blocks(w_i, w_o):
@@ -100,8 +121,6 @@ def texel_major(sample):
 
 def _table(sample):
     """Linear value of every code; for float32 samples the scale alone."""
-    from btfpipe.sample.transfer import decode_table
-
     if sample.codes.dtype == np.float32:
         if sample.transfer != "linear":
             raise InputError(

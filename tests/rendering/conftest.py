@@ -95,6 +95,8 @@ def scene_file(tmp_path):
             ],
             "objects": objects,
         } | changes
+        # what one ray shows of one texel; averages over pixels have tests of their own (test_texture_filter.py)
+        scene["film"] = {"texture_filter": False} | scene["film"]
         path = tmp_path / name
         path.write_text(yaml.safe_dump(_plain(scene)))
         return path

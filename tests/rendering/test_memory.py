@@ -83,6 +83,12 @@ def test_objects_of_one_model_share_its_shader_and_count_once(
     error, two = refused(path)
     assert error.count("m.sample.npz") == 1
     assert two - refused(scene_file([entry], "one.yaml"))[1] <= 1
+    # and so do its levels of detail, a third of it in half precision
+    film = {"film": {"width": 64, "height": 64, "samples": 1, "texture_filter": True}}
+    error, filtered = refused(scene_file([entry, entry], "two.yaml", **film))
+    assert error.count("m.sample.npz") == 1
+    assert filtered - refused(scene_file([entry], "one.yaml", **film))[1] <= 1
+    assert filtered > two
     first, second = (thing.dressing.shader for thing in load_scene(path).objects)
     assert first is second
 
@@ -136,21 +142,28 @@ def _is_mapped(array):
     return array is not None
 
 
+@pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux's /proc")
 def test_a_render_stays_within_the_memory_that_it_is_given(
-    make_sample, scene_file, sphere, refused, btfpipe, tmp_path
+    make_sample, scene_file, sphere, refused, btfpipe, tmp_path, filtered
 ):
+    density = 300.0 if filtered else 1.0  # several texels a pixel
     sample = make_sample(rows=96, cols=96)
     sample.save(tmp_path / "m.sample.npz")
     compress([sample], "view-pca", components=5).save(tmp_path / "v.npz")
     compress([sample], "coded", target_bytes=200_000).save(tmp_path / "c.npz")
     write_picture(tmp_path / "room.exr", np.ones((64, 128, 3), np.float32))
-    worn = sphere(lambda lat, lon: (47 + 25 * lat, 15 + 10 * lon), rings=200, segments=400)
+    worn = sphere(
+        lambda lat, lon: (47 + 25 * lat, 15 + 10 * lon),
+        rings=200,
+        segments=400,
+        texels_per_unit=density,
+    )
     rng = np.random.default_rng(1)
     zero = np.zeros((2, 300 * 300), np.float32)
     domain = {"plane": [300, 300], "toroidal": True}
     row, col = rng.uniform(0, 95, (2, *zero.shape))  # no two neighbours in one piece
-    CoordinateMap(row, col, zero, 1.0, domain, zero + 0.5).save(tmp_path / "plane.map.npz")
+    CoordinateMap(row, col, zero, density, domain, zero + 0.5).save(tmp_path / "plane.map.npz")
     path = scene_file(
         [
             worn,
@@ -158,7 +171,7 @@ def test_a_render_stays_within_the_memory_that_it_is_given(
             worn | {"model": "v.npz"},
         ],
         lights=[*LAMPS, {"type": "environment", "map": "room.exr", "lights": 12}],
-        film={"width": 640, "height": 480, "samples": 4},
+        film={"width": 640, "height": 480, "samples": 4, "texture_filter": filtered},
     )
     need = refused(path)[1]
     command = ["render", path, "-o", tmp_path / "p.exr", "--memory", f"{need}M", "-t", 2, "-q"]
