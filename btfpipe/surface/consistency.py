@@ -9,12 +9,11 @@ _STEEPEST = 0.35
 # Pull towards the given surface, in the equation of one vertex. Heights follow normals up to some seven edges
 # far, the facets of an input mesh seen in a dense resampling of it, and not farther.
 _SCREENING = 0.03
-_MOST_EDGES = 2.0
 _MOST_ITERATIONS = 100
 _TOLERANCE = 1e-3
 
 
-def consistent_positions(vertices, faces, normals, ease=1.0):
+def consistent_positions(vertices, faces, normals, most):
     """Move vertices along their shading normals so that the triangles agree with these.
 
     A coarse mesh that is resampled densely keeps its facets, while shading normals turn smoothly across them.
@@ -35,15 +34,14 @@ def consistent_positions(vertices, faces, normals, ease=1.0):
     faces : (m, 3) int32
     normals : (n, 3) float64 or float32
         Unit shading normals.
-    ease : float or (n,) float64
-        Fraction of its height that a vertex moves: 0 for those that must stay.
+    most : float or (n,) float64
+        How far each vertex may move.
 
     Returns
     -------
     (n, 3) float64
-        No vertex moves farther than two edges of mean length.
     """
-    heights = np.asarray(ease * _heights(vertices, faces, np.asarray(normals, np.float64)))
+    heights = np.clip(_heights(vertices, faces, np.asarray(normals, np.float64)), -most, most)
     return vertices + heights[:, None] * normals
 
 
@@ -53,8 +51,7 @@ def _heights(vertices, faces, normals):
     weight = np.empty(len(after))
     degree, wanted, edge = (np.empty(len(vertices)) for _ in range(3))
     _equations(vertices, normals, first, after, weight, degree, wanted, edge)
-    limit = _MOST_EDGES * edge.mean()
-    return np.clip(_solve(first, after, weight, degree, wanted), -limit, limit)
+    return _solve(first, after, weight, degree, wanted)
 
 
 def _neighbours(faces, count):

@@ -9,6 +9,7 @@ import numpy as np
 from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
+from btfpipe.surface.consistency import consistent_positions
 from btfpipe.surface.curl import curl_facts
 from btfpipe.surface.deviation import (
     MOST_SPACINGS,
@@ -27,6 +28,7 @@ from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 _TOLERANCE = 0.05
 _MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
 _MOST_TRIED = 1_000_000
+_MOST_FITTED = 0.5  # spacings that a vertex moves to agree with the normals
 _FIELD_ROUNDS = 10
 _FEWEST = 20  # vertices of the coarsest level
 # measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
@@ -115,7 +117,7 @@ def prepare(
         normals = source.normals(place, weights)
         levels.append(
             Level(
-                source.lift(place, weights), fine,
+                _positions(source, made, normals), fine,
                 normals.astype(np.float32), np.zeros_like(normals, np.float32),
             )
         )  # fmt: skip
@@ -172,6 +174,27 @@ def _check_levels(name, n_vertices, n_levels):
             f"{name}: {n_levels} levels of {n_vertices} vertices leave {n_vertices // 4 ** (n_levels - 1)} on the coarsest;"
             f" expected at least {_FEWEST}. Ask for at most {fitting} with --levels, or for more vertices."
         )
+
+
+def _positions(source, made, normals):
+    """Vertices on the smooth surface, moved so that triangles agree with their normals where facets were wide.
+
+    Each moves by `_MOST_FITTED` of a spacing at most, by twice what the smoothing moves the faces of the input around
+    it, and no farther from the input than the smoothing moves at most.
+    """
+    faces, place, weights = made
+    lifted = source.lift(place, weights)
+    if source.alpha == 0:
+        return lifted
+    moves = source.largest_moves()
+    around = np.zeros(len(source.vertices))
+    np.maximum.at(around, source.faces, moves[:, None])
+    near = np.einsum("kc,kc->k", weights, around[source.faces[place]])
+    most = np.minimum(_MOST_FITTED * made.spacing, 2 * near)
+    flat = source.flat(place, weights)
+    move = consistent_positions(lifted, faces, normals, most) - flat
+    length = np.linalg.norm(move, axis=1, keepdims=True)
+    return flat + move * np.minimum(1, moves.max() / np.maximum(length, 1e-300))
 
 
 def _most_vertices(memory):

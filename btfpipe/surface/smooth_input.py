@@ -60,6 +60,16 @@ class SmoothInput:
         eased = weights * self.ease[self.faces[face]]
         return flat - self.alpha * np.einsum("kc,kc,kcx->kx", eased, above, normals)
 
+    def largest_moves(self):
+        """How far `lift` moves points of each face, (m,) float64: the most of its middle and those of its edges."""
+        face = np.arange(len(self.faces))
+        most = np.zeros(len(face))
+        for weights in ((1, 1, 1), (1, 1, 0), (0, 1, 1), (1, 0, 1)):
+            w = np.tile(np.array(weights) / sum(weights), (len(face), 1))
+            move = self.lift(face, w) - self.flat(face, w)
+            most = np.maximum(most, np.linalg.norm(move, axis=1))
+        return most
+
     def normals(self, face, weights):
         """Unit shading normals, (k, 3) float64, interpolated from the corners."""
         normals = np.einsum("kc,kcx->kx", weights, self.corner_normals[face])

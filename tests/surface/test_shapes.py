@@ -164,7 +164,7 @@ def test_boxes_stay_boxes_though_smoothed():
         assert facts["area_ratio"] == pytest.approx(1, abs=1e-3)
         assert facts["smoothing_moved"]["max"] < 1e-9 + 1e-3 * facts["spacing"]
     # and a ring of facets is rounded: the cylinder's area comes nearer to the round one's
-    made, facts = prepare(*SHAPES["cylinder"](), 10_000, 1)
+    _, facts = prepare(*SHAPES["cylinder"](), 10_000, 1)
     assert facts["smoothing_moved"]["max"] > 0
     assert (
         facts["distance"]["result_to_input"]["max"]
@@ -176,12 +176,14 @@ def sheets(gap):
     """Two squares above each other, as one mesh of two parts."""
     square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], float)
     faces = np.array([(0, 1, 2), (0, 2, 3)])
-    return np.concatenate([square, square + (0, 0, gap)]), np.concatenate([faces, faces + 4])
+    return np.concatenate([square, square + np.array((0, 0, gap))]), np.concatenate(
+        [faces, faces + 4]
+    )
 
 
 def test_deviation_is_the_distance_of_what_is_apart():
     vertices, faces = sheets(0.01)
-    lifted = vertices + (0, 0, 0.002)
+    lifted = vertices + np.array((0, 0, 0.002))
     found = deviation.measure(lifted, faces, vertices, faces, 0.1)
     assert found.from_input.max() == pytest.approx(0.002)
     assert found.to_input.max() == pytest.approx(0.002)
