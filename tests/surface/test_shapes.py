@@ -160,7 +160,7 @@ def test_coarser_levels_say_how_far_off_they_are():
 def test_boxes_stay_boxes_though_smoothed():
     """Rounding is for facets: corners of 90 degrees are shape."""
     for name in ("beam", "comb"):
-        made, facts = prepare(*SHAPES[name](), 3000, 1)
+        _, facts = prepare(*SHAPES[name](), 3000, 1)
         assert facts["area_ratio"] == pytest.approx(1, abs=1e-3)
         assert facts["smoothing_moved"]["max"] < 1e-9 + 1e-3 * facts["spacing"]
     # and a ring of facets is rounded: the cylinder's area comes nearer to the round one's
