@@ -228,7 +228,11 @@ def test_a_mesh_is_described(info, tmp_path):
     (tmp_path / "b.obj").write_text("\n".join(text[:4]))
     assert "no faces" in info(tmp_path / "b.obj")["problems"][0]
     (tmp_path / "c.obj").write_text("\n".join([*text, "v 3 3 3", "f 1 2 5"]))
-    assert "faces" in info(tmp_path / "c.obj")["problems"][0]
+    fin = info(tmp_path / "c.obj")
+    assert (fin["components"], fin["boundary_loops"], fin["problems"]) == (2, 1, [])
+    assert fin["repairs"]["parted_edges"] == 1
+    (tmp_path / "d.obj").write_text("\n".join([*text[:4], "v nan 0 0", "f 1 2 5"]))
+    assert "not finite" in info(tmp_path / "d.obj")["problems"][0]
 
 
 @pytest.mark.parametrize(

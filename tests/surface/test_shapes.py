@@ -85,7 +85,7 @@ def test_shapes_are_kept_at_three_thousand_vertices(name):
 @pytest.mark.parametrize(
     "name",
     [
-        name if name in ("hedgehog", "cage") else pytest.param(name, marks=pytest.mark.slow)
+        name if name == "cage" else pytest.param(name, marks=pytest.mark.slow)
         for name in sorted(SHAPES)
     ],
 )
