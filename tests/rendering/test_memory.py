@@ -142,7 +142,7 @@ def _is_mapped(array):
     return array is not None
 
 
-@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize("filtered", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux's /proc")
 def test_a_render_stays_within_the_memory_that_it_is_given(
     make_sample, scene_file, sphere, refused, btfpipe, tmp_path, filtered
