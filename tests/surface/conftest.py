@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from shared_meshes import torus
+from shared_shapes import boxes
 
 _MAKER = Path(__file__).parents[2] / "data-sample" / "make_meshes.py"
 
@@ -33,25 +34,6 @@ def grid(rows=9, cols=13, width=1.5, height=1.0):
     return vertices, np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]).astype(
         np.int32
     )
-
-
-def boxes(solid):
-    """The surface of the cubes of a solid (x, y, z) array of booleans, two triangles a square."""
-    solid = np.pad(solid, 1)
-    quads = []
-    for axis in range(3):
-        for side in (-1, 1):
-            free = solid & ~np.roll(solid, -side, axis)
-            for cell in np.argwhere(free):
-                corner = cell + (np.eye(3, dtype=int)[axis] if side > 0 else 0)
-                u, w = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
-                quad = [corner, corner + u, corner + u + w, corner + w]
-                quads.append(quad if side > 0 else quad[::-1])
-    points, index = np.unique(np.array(quads).reshape(-1, 3), axis=0, return_inverse=True)
-    a, b, c, d = index.reshape(-1, 4).T
-    return points.astype(float), np.concatenate(
-        [np.stack([a, b, c], 1), np.stack([a, c, d], 1)]
-    ).astype(np.int32)
 
 
 def double_ring():
