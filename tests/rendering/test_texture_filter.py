@@ -72,7 +72,7 @@ def error(found, truth, inside=None):
     return np.sqrt(((found - truth) ** 2).mean()) / truth.mean()
 
 
-@pytest.mark.parametrize("texels", [2.3, 4.5])
+@pytest.mark.parametrize("texels", [pytest.param(2.3, marks=pytest.mark.slow), 4.5])
 @pytest.mark.parametrize("model", ["svd.npz", "coded.npz"])
 def test_16_filtered_rays_are_as_good_as_very_many(models, model, texels):
     path = plane(models, model, texels)
@@ -81,6 +81,7 @@ def test_16_filtered_rays_are_as_good_as_very_many(models, model, texels):
     assert error(picture(path, 16, True), truth) < 0.02
 
 
+@pytest.mark.slow
 def test_a_plane_towards_the_horizon(models):
     camera = {
         "type": "perspective",
@@ -109,6 +110,7 @@ def test_no_blur_where_a_texel_covers_a_pixel(models):
     np.testing.assert_allclose(filtered[..., :3].std(axis=(0, 1)), contrast, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_moving_camera_does_not_flicker(models):
     """Moved by whole texels along a plane whose sample repeats, nothing else changes: frames differ by what rays miss."""
     frames = {True: [], False: []}
@@ -204,6 +206,7 @@ def test_levels_of_a_sample_are_its_averaged_pictures(dtype):
     np.testing.assert_allclose(values, sample.pictures(slice(0, 19)).mean(axis=(1, 2)), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_map_of_small_pieces(models, rng):
     """Pieces of 6 x 6 texels from anywhere, each other than its neighbours: most pixels see several."""
     from btfpipe.synthesis import CoordinateMap
@@ -225,6 +228,7 @@ def test_a_map_of_small_pieces(models, rng):
     np.testing.assert_array_equal(picture(path, 16, True, threads=2), found)
 
 
+@pytest.mark.slow
 def test_a_material_of_a_database_and_a_masked_sample(models):
     """Levels of a material are its own; texels that were not measured count for nothing."""
     other = weave()

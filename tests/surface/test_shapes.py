@@ -16,6 +16,7 @@ from btfpipe.surface.cleaning import clean
 from btfpipe.surface.prepare import prepare
 from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
+QUICK = {"plank", "comb", "starfish", "hedgehog", "capsule"}
 SMOOTH = {"cylinder", "starfish", "capsule"}
 # lines closer to each other than half a spacing force edges as short
 CROWDED = {("plank", 3000): 0.22, ("hedgehog", 3000): 0.22}
@@ -77,18 +78,19 @@ def check(name, mesh, n, evenness):
     assert said["result_to_input"]["max"] == pytest.approx(back, abs=0.1 * spacing)
 
 
-@pytest.mark.parametrize("name", sorted(SHAPES.keys() - {"cage"}))
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+        for name in sorted(SHAPES.keys() - {"cage"})
+    ],
+)
 def test_shapes_are_kept_at_three_thousand_vertices(name):
     check(name, SHAPES[name](), 3000, CROWDED.get((name, 3000), 0.12 if name in SMOOTH else 0.2))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name == "cage" else pytest.param(name, marks=pytest.mark.slow)
-        for name in sorted(SHAPES)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(SHAPES))
 def test_shapes_are_kept_at_thirty_thousand_vertices(name):
     check(name, SHAPES[name](), 30_000, 0.12 if name in SMOOTH else 0.2)
 
