@@ -253,7 +253,7 @@ def test_a_material_of_a_database_and_a_masked_sample(models):
 
 
 def test_levels_report_that_they_are_made(models):
-    scene = load_scene(plane(models, "coded.npz", 4.5, size=8))
+    scene = load_scene(plane(models, "coded.npz", 4.5, size=8), film={"texture_filter": True})
     told = []
 
     @contextlib.contextmanager

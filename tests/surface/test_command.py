@@ -225,7 +225,7 @@ def test_a_spike_keeps_its_height_and_grows_no_thicker(btfpipe, tmp_path):
     mesh.write_text("\n".join(rows))
     out = tmp_path / "s.npz"
     done = btfpipe("surface", mesh, "-o", out, "--vertices", 1000, "--levels", 1, "--json")
-    assert json.loads(done.stdout)["area_ratio"] == pytest.approx(1, abs=0.01)
+    assert json.loads(done.stdout)["area_ratio"] == pytest.approx(1, abs=0.02)
     assert Surface.open(out).levels[0].vertices[:, 2].max() == pytest.approx(90.0001)
 
 
