@@ -14,25 +14,22 @@ genus.
 """
 
 import numpy as np
-from numba import prange
 
 from btfpipe.compiled import njit
 
-_DAMPING = 0.5  # all vertices move at once: whole steps would overshoot and oscillate
 _FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge
-_TURNED = 0.5  # cosine of the turn of a normal that makes a fold
+_FOLD = 0.2  # cosine of the turn of a normal in a collapse that makes a fold
 _STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
-_BESIDE = 0.4  # weight of a line's neighbours beside it, against 1 on it
 _RING = 96  # vertices of more neighbours than this are left alone
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _next(h):
+def next_of(h):
     return h + 1 if h % 3 < 2 else h - 2
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _previous(h):
+def previous_of(h):
     return h - 1 if h % 3 > 0 else h + 2
 
 
@@ -55,7 +52,7 @@ def _settle(opposite, leave, v, h):
         g = opposite[h]
         if g < 0:
             break
-        h = _next(g)
+        h = next_of(g)
         if h == start:
             break
     leave[v] = h
@@ -70,9 +67,9 @@ def _ring(corner, opposite, leave, v, out, around):
         if n >= _RING - 1:
             return -1, -1
         out[n] = h
-        around[n] = corner[_next(h)]
+        around[n] = corner[next_of(h)]
         n += 1
-        p = _previous(h)
+        p = previous_of(h)
         g = opposite[p]
         if g < 0:
             around[n] = corner[p]
@@ -92,7 +89,7 @@ def _length2(points, a, b):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _cross(ax, ay, az, bx, by, bz, cx, cy, cz):
+def cross(ax, ay, az, bx, by, bz, cx, cy, cz):
     """Twice the area vector of the triangle a, b, c."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = cx - ax, cy - ay, cz - az
@@ -106,22 +103,35 @@ def _longest_beside(corner, opposite, points, h):
     for i in range(2):
         g = h if i == 0 else opposite[h]
         if g >= 0:
-            c = corner[_previous(g)]
+            c = corner[previous_of(g)]
             longest = max(longest, _length2(points, c, corner[g]))
-            longest = max(longest, _length2(points, c, corner[_next(g)]))
+            longest = max(longest, _length2(points, c, corner[next_of(g)]))
     return longest
 
 
 @njit(cache=True, nogil=True)
 def _area2(points, corner, h):
     """The square of twice the area of the face at h."""
-    a, b, c = corner[h], corner[_next(h)], corner[_previous(h)]
-    x, y, z = _cross(
+    a, b, c = corner[h], corner[next_of(h)], corner[previous_of(h)]
+    x, y, z = cross(
         points[a, 0], points[a, 1], points[a, 2],
         points[b, 0], points[b, 1], points[b, 2],
         points[c, 0], points[c, 1], points[c, 2],
     )  # fmt: skip
     return x * x + y * y + z * z
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _halve(corner, opposite, feature, origin, h, m, n_faces):
+    """Cut the face (a, b, c) at h into (a, m, c) in place and (m, b, c) behind the last; returns the latter's first half-edge."""
+    f, h1 = 3 * n_faces, next_of(h)
+    outer, mark = opposite[h1], feature[h1]
+    corner[f], corner[f + 1], corner[f + 2] = m, corner[h1], corner[previous_of(h)]
+    corner[h1] = m
+    origin[n_faces] = origin[h // 3]
+    _join(opposite, feature, f + 1, outer, mark)
+    _join(opposite, feature, f + 2, h1, 0)
+    return f
 
 
 @njit(cache=True, nogil=True)
@@ -130,7 +140,7 @@ def _split(
     n_vertices, n_faces, h, near,
 ):  # fmt: skip
     """Halve the edge at h; `near` says that feature lines are followed from its ends. Returns the new numbers."""
-    a, b = corner[h], corner[_next(h)]
+    a, b = corner[h], corner[next_of(h)]
     g = opposite[h]
     mark = feature[h]
     m = n_vertices
@@ -144,39 +154,20 @@ def _split(
         # nearer than where the whole edge once was
         along[m] = along[a] if kind[a] == 1 else (along[b] if kind[b] == 1 else mark - 1)
     place[m] = origin[h // 3]
-    # (a, b, c) becomes (a, m, c) in place and (m, b, c) behind
-    f = 3 * n_faces
-    origin[n_faces] = origin[h // 3]
+    f = _halve(corner, opposite, feature, origin, h, m, n_faces)
     n_faces += 1
-    h1 = _next(h)
-    c = corner[_previous(h)]
-    outer, outer_mark = opposite[h1], feature[h1]
-    corner[h1] = m
-    corner[f], corner[f + 1], corner[f + 2] = m, b, c
-    _join(opposite, feature, f + 1, outer, outer_mark)
-    _join(opposite, feature, f + 2, h1, 0)
     if g < 0:
         _join(opposite, feature, f, -1, mark)
         _join(opposite, feature, h, -1, mark)
-        leave[m] = f
     else:
-        # (b, a, d) becomes (m, a, d) behind and (b, m, d) in place
-        e = 3 * n_faces
-        origin[n_faces] = origin[g // 3]
+        e = _halve(corner, opposite, feature, origin, g, m, n_faces)
         n_faces += 1
-        g1 = _next(g)
-        d = corner[_previous(g)]
-        outer, outer_mark = opposite[g1], feature[g1]
-        corner[g1] = m
-        corner[e], corner[e + 1], corner[e + 2] = m, a, d
-        _join(opposite, feature, e + 1, outer, outer_mark)
-        _join(opposite, feature, e + 2, g1, 0)
         _join(opposite, feature, e, h, mark)
         _join(opposite, feature, f, g, mark)
-        leave[m] = f
-        if g >= 0 and leave[a] == g1:
+        if leave[a] == next_of(g):
             leave[a] = e + 1
-    if leave[b] == h1:
+    leave[m] = f
+    if leave[b] == next_of(h):
         leave[b] = f + 1
     return n_vertices, n_faces
 
@@ -203,7 +194,7 @@ def split_long(
             h += 1
             if corner[h - h % 3] < 0 or opposite[h] > h:
                 continue
-            a, b = corner[h], corner[_next(h)]
+            a, b = corner[h], corner[next_of(h)]
             length = _length2(points, a, b)
             if length <= limit:
                 continue
@@ -255,13 +246,13 @@ def _folds(corner, points, out, n, skip1, skip2, x, y, z, least):
         h = out[i]
         if h // 3 == skip1 or h // 3 == skip2:
             continue
-        a, b, c = corner[h], corner[_next(h)], corner[_previous(h)]
-        ox, oy, oz = _cross(
+        a, b, c = corner[h], corner[next_of(h)], corner[previous_of(h)]
+        ox, oy, oz = cross(
             points[a, 0], points[a, 1], points[a, 2],
             points[b, 0], points[b, 1], points[b, 2],
             points[c, 0], points[c, 1], points[c, 2],
         )  # fmt: skip
-        nx, ny, nz = _cross(
+        nx, ny, nz = cross(
             x, y, z,
             points[b, 0], points[b, 1], points[b, 2],
             points[c, 0], points[c, 1], points[c, 2],
@@ -280,10 +271,10 @@ def _collapse(
 ):  # fmt: skip
     """Collapse the edge at h, from its start to its end, if nothing folds, tears or gets too long; returns whether."""
     g = opposite[h]
-    a, b = corner[h], corner[_next(h)]
+    a, b = corner[h], corner[next_of(h)]
     if kind[a] == 2 or (kind[a] == 1 and feature[h] == 0):
         return False
-    h1, h2 = _next(h), _previous(h)
+    h1, h2 = next_of(h), previous_of(h)
     if kind[a] == 1 and feature[h2]:
         return False
     boundary_a, boundary_b = opposite[leave[a]] < 0, opposite[leave[b]] < 0
@@ -306,7 +297,7 @@ def _collapse(
         return False
     inner1, inner2 = -1, -1
     if g >= 0:
-        g1, g2 = _next(g), _previous(g)
+        g1, g2 = next_of(g), previous_of(g)
         inner1, inner2 = opposite[g1], opposite[g2]
         if inner1 < 0 and inner2 < 0:
             return False
@@ -336,9 +327,9 @@ def _collapse(
     for axis in range(3):
         flat[b, axis] += share * (flat[a, axis] - flat[b, axis])
     c = corner[h2]
-    d = corner[_previous(g)] if g >= 0 else -1
+    d = corner[previous_of(g)] if g >= 0 else -1
     mark = max(feature[h1], feature[h2])
-    inner_mark = max(feature[_next(g)], feature[_previous(g)]) if g >= 0 else 0
+    inner_mark = max(feature[next_of(g)], feature[previous_of(g)]) if g >= 0 else 0
     for i in range(faces_a):
         corner[out_a[i]] = b
     corner[3 * f0] = -1
@@ -347,20 +338,19 @@ def _collapse(
         corner[3 * f1] = -1
         _join(opposite, feature, inner1, inner2, inner_mark)
     leave[a] = -1
-    _settle(opposite, leave, b, outer2 if outer2 >= 0 else _next(outer1))
-    _settle(opposite, leave, c, outer1 if outer1 >= 0 else _next(outer2))
+    _settle(opposite, leave, b, outer2 if outer2 >= 0 else next_of(outer1))
+    _settle(opposite, leave, c, outer1 if outer1 >= 0 else next_of(outer2))
     if g >= 0:
-        _settle(opposite, leave, d, inner1 if inner1 >= 0 else _next(inner2))
+        _settle(opposite, leave, d, inner1 if inner1 >= 0 else next_of(inner2))
     return True
 
 
 @njit(cache=True, nogil=True)
 def collapse_short(
-    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest, least
+    corner, opposite, feature, leave, kind, points, flat, n_faces, shortest, longest
 ):
     """Collapse edges shorter than `shortest` where nothing folds, tears or gets longer than `longest`.
 
-    A fold is a normal that turns so that its cosine is below `least`.
     Returns the number of collapses. Features are shortened only along themselves, and a component
     or a hole never vanishes (link condition).
     """
@@ -371,12 +361,12 @@ def collapse_short(
     for start in range(3 * n_faces):
         if corner[start - start % 3] < 0 or opposite[start] > start:
             continue
-        if _length2(points, corner[start], corner[_next(start)]) >= limit:
+        if _length2(points, corner[start], corner[next_of(start)]) >= limit:
             continue
         for side in range(2):
             h = start if side == 0 else opposite[start]
             if h >= 0 and _collapse(
-                corner, opposite, feature, leave, kind, points, flat, h, bound, least,
+                corner, opposite, feature, leave, kind, points, flat, h, bound, _FOLD,
                 out_a, out_b, near_a, near_b,
             ):  # fmt: skip
                 done += 1
@@ -396,7 +386,7 @@ def collapse_of(corner, opposite, feature, leave, kind, points, flat, chosen):
             k, least = -1, np.inf
             for i in range(3):
                 if corner[3 * f] >= 0 and tried[i] == 0:
-                    length = _length2(points, corner[3 * f + i], corner[_next(3 * f + i)])
+                    length = _length2(points, corner[3 * f + i], corner[next_of(3 * f + i)])
                     if length < least:
                         k, least = i, length
             if k < 0:
@@ -423,7 +413,7 @@ def _may_lose(corner, opposite, leave, v):
     n = 0
     while n < 4:
         n += 1
-        h = opposite[_previous(h)]
+        h = opposite[previous_of(h)]
         if h == leave[v]:
             break
     return n > 3
@@ -451,8 +441,8 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         g = opposite[h]
         if corner[h - h % 3] < 0 or g < h or feature[h]:
             continue
-        h1, h2 = _next(h), _previous(h)
-        g1, g2 = _next(g), _previous(g)
+        h1, h2 = next_of(h), previous_of(h)
+        g1, g2 = next_of(g), previous_of(g)
         a, b, c, d = corner[h], corner[h1], corner[h2], corner[g2]
         if by_degree:
             before = excess[a] ** 2 + excess[b] ** 2 + excess[c] ** 2 + excess[d] ** 2
@@ -472,18 +462,18 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
         bx, by, bz = points[b, 0], points[b, 1], points[b, 2]
         cx, cy, cz = points[c, 0], points[c, 1], points[c, 2]
         dx, dy, dz = points[d, 0], points[d, 1], points[d, 2]
-        px, py, pz = _cross(ax, ay, az, bx, by, bz, cx, cy, cz)
-        qx, qy, qz = _cross(bx, by, bz, ax, ay, az, dx, dy, dz)
-        ux, uy, uz = _cross(ax, ay, az, dx, dy, dz, cx, cy, cz)
-        vx, vy, vz = _cross(dx, dy, dz, bx, by, bz, cx, cy, cz)
+        px, py, pz = cross(ax, ay, az, bx, by, bz, cx, cy, cz)
+        qx, qy, qz = cross(bx, by, bz, ax, ay, az, dx, dy, dz)
+        ux, uy, uz = cross(ax, ay, az, dx, dy, dz, cx, cy, cz)
+        vx, vy, vz = cross(dx, dy, dz, bx, by, bz, cx, cy, cz)
         sx, sy, sz = px + qx, py + qy, pz + qz
         size = np.sqrt(sx * sx + sy * sy + sz * sz)
         if ux * sx + uy * sy + uz * sz <= 0.3 * size * np.sqrt(
             ux * ux + uy * uy + uz * uz
         ) or vx * sx + vy * sy + vz * sz <= 0.3 * size * np.sqrt(vx * vx + vy * vy + vz * vz):
             continue
-        bent = _cosine(px, py, pz, qx, qy, qz)
-        if bent < _FLAT and _cosine(ux, uy, uz, vx, vy, vz) < bent:
+        bent = cosine(px, py, pz, qx, qy, qz)
+        if bent < _FLAT and cosine(ux, uy, uz, vx, vy, vz) < bent:
             continue
         o_bc, m_bc = opposite[h1], feature[h1]
         o_ca, m_ca = opposite[h2], feature[h2]
@@ -509,82 +499,20 @@ def flip_edges(corner, opposite, feature, leave, points, n_faces, by_degree):
     return done
 
 
-@njit(cache=True, nogil=True)
-def name_origins(corner, n_faces, kind, place, origin):
-    """Set the origin of each face to the place of one of its free vertices, if it has one."""
-    for f in range(n_faces):
-        for k in range(3):
-            v = corner[3 * f + k]
-            if kind[v] == 0:
-                origin[f] = place[v]
-
-
 @njit(cache=True, nogil=True, inline="always")
-def _cosine(px, py, pz, qx, qy, qz):
+def cosine(px, py, pz, qx, qy, qz):
     """Cosine of the angle between two vectors, 1 if one is zero."""
     size = np.sqrt((px * px + py * py + pz * pz) * (qx * qx + qy * qy + qz * qz))
     return (px * qx + py * qy + pz * qz) / size if size > 0.0 else 1.0
 
 
 @njit(cache=True, nogil=True)
-def folded(corner, n_faces, points, place, moved, moved_place, normals, keep):
-    """Mark the vertices of faces that a move of all vertices turns over; returns whether there are any.
-
-    A face is turned over if its normal turns by more than 60 degrees and then agrees less than
-    before with the normals of the input where its corners lie.
-
-    Parameters
-    ----------
-    corner : (3 m,) int32
-    n_faces : int
-    points, moved : (n, 3) float64
-        Before and after the move.
-    place, moved_place : (n,) int32
-        Faces of the input, before and after.
-    normals : (faces of the input, 3) float64
-    keep : (n,) uint8
-        Set to 1 for what should stay.
-    """
-    found = False
-    for f in range(n_faces):
-        a, b, c = corner[3 * f], corner[3 * f + 1], corner[3 * f + 2]
-        ox, oy, oz = _cross(
-            points[a, 0], points[a, 1], points[a, 2],
-            points[b, 0], points[b, 1], points[b, 2],
-            points[c, 0], points[c, 1], points[c, 2],
-        )  # fmt: skip
-        nx, ny, nz = _cross(
-            moved[a, 0], moved[a, 1], moved[a, 2],
-            moved[b, 0], moved[b, 1], moved[b, 2],
-            moved[c, 0], moved[c, 1], moved[c, 2],
-        )  # fmt: skip
-        if _cosine(ox, oy, oz, nx, ny, nz) >= _TURNED:
-            continue
-        before = _agreement(normals, place[a], place[b], place[c], ox, oy, oz)
-        if _agreement(normals, moved_place[a], moved_place[b], moved_place[c], nx, ny, nz) < before:
-            found = True
-            keep[a] = keep[b] = keep[c] = 1
-    return found
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _agreement(normals, i, j, k, x, y, z):
-    """Cosine of the angle between a vector and the sum of three normals."""
-    return _cosine(
-        normals[i, 0] + normals[j, 0] + normals[k, 0],
-        normals[i, 1] + normals[j, 1] + normals[k, 1],
-        normals[i, 2] + normals[j, 2] + normals[k, 2],
-        x, y, z,
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
 def _adjacent(corner, opposite, leave, a, b):
     h = leave[a]
     for _ in range(1000):
-        if corner[_next(h)] == b:
+        if corner[next_of(h)] == b:
             return True
-        p = _previous(h)
+        p = previous_of(h)
         if opposite[p] < 0:
             return corner[p] == b
         h = opposite[p]
@@ -609,79 +537,6 @@ def _cotangent(points, v, a, b):
     cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
     area = np.sqrt(cx * cx + cy * cy + cz * cz)
     return (ux * wx + uy * wy + uz * wz) / max(area, 1e-300)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def relax(corner, opposite, feature, leave, kind, points, n_vertices, step):
-    """Fill `step` with each vertex's move towards the middle of its neighbours, within the tangent plane.
-
-    Neighbours are weighted by the areas around the edge to them, so that crowded vertices spread.
-    Vertices of kind 1 move along their line, towards the middle of its two neighbours and a little towards that
-    of all others, so that vertices on lines close to each other interleave. Those of kind 2 stay.
-    """
-    for v in prange(n_vertices):
-        step[v, 0] = step[v, 1] = step[v, 2] = 0.0
-        h = leave[v]
-        if h < 0 or kind[v] == 2:
-            continue
-        x, y, z = points[v, 0], points[v, 1], points[v, 2]
-        nx = ny = nz = cx = cy = cz = total = 0.0
-        # of a line: where it goes on either way
-        fx = fy = fz = gx = gy = gz = 0.0
-        while True:
-            b, c = corner[_next(h)], corner[_previous(h)]
-            if kind[v] == 1:
-                weight = _BESIDE
-                if feature[h]:
-                    weight = 1.0
-                    gx, gy, gz = fx, fy, fz
-                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
-                cx += weight * points[b, 0]
-                cy += weight * points[b, 1]
-                cz += weight * points[b, 2]
-                total += weight
-            else:
-                ex, ey, ez = _cross(
-                    x, y, z,
-                    points[b, 0], points[b, 1], points[b, 2],
-                    points[c, 0], points[c, 1], points[c, 2],
-                )  # fmt: skip
-                nx += ex
-                ny += ey
-                nz += ez
-                area = np.sqrt(ex * ex + ey * ey + ez * ez)
-                total += 2.0 * area
-                cx += area * (points[b, 0] + points[c, 0])
-                cy += area * (points[b, 1] + points[c, 1])
-                cz += area * (points[b, 2] + points[c, 2])
-            p = _previous(h)
-            h = opposite[p]
-            if h < 0:
-                if kind[v] == 1:
-                    b = corner[p]
-                    gx, gy, gz = fx, fy, fz
-                    fx, fy, fz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
-                    cx += points[b, 0]
-                    cy += points[b, 1]
-                    cz += points[b, 2]
-                    total += 1.0
-                break
-            if h == leave[v]:
-                break
-        if total <= 0.0:
-            continue
-        dx, dy, dz = cx / total - x, cy / total - y, cz / total - z
-        if kind[v] == 0:
-            n2 = nx * nx + ny * ny + nz * nz
-            if n2 > 0.0:
-                k = (dx * nx + dy * ny + dz * nz) / n2
-                dx, dy, dz = dx - k * nx, dy - k * ny, dz - k * nz
-        else:
-            fx, fy, fz = fx - gx, fy - gy, fz - gz
-            f2 = fx * fx + fy * fy + fz * fz
-            k = (dx * fx + dy * fy + dz * fz) / f2 if f2 > 0.0 else 0.0
-            dx, dy, dz = k * fx, k * fy, k * fz
-        step[v, 0], step[v, 1], step[v, 2] = _DAMPING * dx, _DAMPING * dy, _DAMPING * dz
 
 
 @njit(cache=True, nogil=True)

@@ -19,6 +19,8 @@ two positions. Its faces are paired
 
 import numpy as np
 
+from btfpipe.surface.topology import half_edges
+
 SAME_ANGLE = 1e-7  # radians; faces that lie on each other
 
 
@@ -46,12 +48,12 @@ def pair_half_edges(vertices, faces, alias):
     cut : int
         Edges of two faces that are left unpaired because the surface is one-sided.
     """
-    start, end = sides(faces)
+    start, end = half_edges(faces)
     edge = order, run, counts = runs(undirected(start, end))
     opposite = np.full(faces.size, -1, np.int32)
     join_twos(opposite, *edge)
     crowded = np.flatnonzero(counts[run] > 2)
-    left, number = _join_by_file(opposite, order[crowded], run[crowded], *sides(alias))
+    left, number = _join_by_file(opposite, order[crowded], run[crowded], *half_edges(alias))
     sense, piece, cut = _orient_pieces(vertices, faces, opposite, start)
     if len(left):
         undecided = np.zeros(faces.size, bool)
@@ -61,11 +63,6 @@ def pair_half_edges(vertices, faces, alias):
         facing = _facing(vertices, faces, sense, order, run)
         _match_crowded(vertices, faces, opposite, left, number, sense, piece, rim, facing)
     return opposite, sense, int((counts > 2).sum()), cut
-
-
-def sides(corners):
-    """Start and end of each half-edge, (3 m,) each, of a table of corners (m, 3)."""
-    return corners.ravel(), corners[:, [1, 2, 0]].ravel()
 
 
 def undirected(a, b):

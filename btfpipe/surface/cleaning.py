@@ -9,6 +9,7 @@ import numpy as np
 from btfpipe.errors import InputError
 from btfpipe.surface import _pairing
 from btfpipe.surface.surface import require_extent
+from btfpipe.surface.topology import half_edges
 
 MERGE_DISTANCE = 1e-7  # of the bounding box's diagonal
 _WELD = (
@@ -132,8 +133,8 @@ def _united(alias, faces, proper, n):
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    start, end = _pairing.sides(alias[~proper])
-    here, there = _pairing.sides(faces[~proper])
+    start, end = half_edges(alias[~proper])
+    here, there = half_edges(faces[~proper])
     start, end = start[here == there], end[here == there]
     if not len(start):
         return alias
@@ -196,7 +197,7 @@ def _directed_triples(corners):
 
 def _sealed(alias):
     """Which faces belong to parts that are closed in the file, each edge of exactly two faces."""
-    order, run, counts = _pairing.runs(_pairing.undirected(*_pairing.sides(alias)))
+    order, run, counts = _pairing.runs(_pairing.undirected(*half_edges(alias)))
     opposite = np.full(alias.size, -1, np.int32)
     _pairing.join_twos(opposite, order, run, counts)
     return _pairing.closed_parts(opposite)[0]
@@ -278,7 +279,7 @@ def _check_area(vertices, faces, name):
 def _check_connected(vertices, faces, name):
     _, first = np.unique(_triples(faces), return_index=True)
     faces = faces[np.sort(first)]
-    order, run, counts = _pairing.runs(_pairing.undirected(*_pairing.sides(faces)))
+    order, run, counts = _pairing.runs(_pairing.undirected(*half_edges(faces)))
     shared = np.empty(faces.size, np.int64)
     shared[order] = counts[run]
     alone = np.flatnonzero((shared.reshape(-1, 3) == 1).all(axis=1))
@@ -400,7 +401,7 @@ def _bisect(vertices, faces, opposite):
 def _repeated_edges(faces, opposite):
     """A half-edge of each edge but the first between its vertices."""
     one = np.flatnonzero((opposite < 0) | (opposite > np.arange(len(opposite))))
-    start, end = _pairing.sides(faces)
+    start, end = half_edges(faces)
     order, run, _ = _pairing.runs(_pairing.undirected(start[one], end[one]))
     return np.sort(one[order[1:][np.diff(run) == 0]])
 
@@ -417,7 +418,7 @@ def _apart(h, opposite, m):
 
 def _halved(vertices, faces, opposite, h):
     """Put a vertex in the middle of edges, given by half-edges, that have no face in common."""
-    start, end = _pairing.sides(faces)
+    start, end = half_edges(faces)
     middle = len(vertices) + np.arange(len(h), dtype=faces.dtype)
     vertices = np.concatenate([vertices, 0.5 * (vertices[start[h]] + vertices[end[h]])])
     g = opposite[h]

@@ -178,10 +178,10 @@ def sharp_tips(vertices, faces, spacing):
     # a cone that opens by an angle a unrolls to 2 pi sin(a / 2)
     tip = around < 2 * np.pi * np.sin(np.deg2rad(TIP_DEG) / 2)
     a, b = vertices[start[knife]], vertices[end[knife]]
-    return np.concatenate([vertices[tip], a, b, _between(a, b, spacing)[0]])
+    return np.concatenate([vertices[tip], a, b, points_between(a, b, spacing)[0]])
 
 
-def _between(a, b, step):
+def points_between(a, b, step):
     """Points between the ends of edges, at most `step` apart, without the ends; and the edge of each."""
     parts = np.ceil(np.linalg.norm(b - a, axis=1) / step).astype(int).clip(1, _MOST_PARTS)
     edge = np.repeat(np.arange(len(a)), parts - 1)
@@ -206,7 +206,7 @@ def _along_edges(vertices, faces, spacing):
     bent = (opposite < 0) | (angle > np.deg2rad(_BENT_DEG))
     for chosen, step in ((bent, spacing / 4), (~bent, spacing / 2)):
         half = np.flatnonzero(once & chosen)
-        found, edge = _between(vertices[start[half]], vertices[end[half]], step)
+        found, edge = points_between(vertices[start[half]], vertices[end[half]], step)
         points.append(found)
         edges.append(half[edge])
     return np.concatenate(points), np.concatenate(edges)

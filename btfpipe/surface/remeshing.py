@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from btfpipe.errors import InputError
-from btfpipe.surface import _edges
-from btfpipe.surface.deviation import Deviation, closest, measure
+from btfpipe.surface import _edges, _moves
+from btfpipe.surface.deviation import Deviation, closest, measure, points_between
 from btfpipe.surface.feature_lines import feature_lines
 from btfpipe.surface.projection import walk_faces, walk_lines
 from btfpipe.surface.topology import (
@@ -28,7 +28,6 @@ _HELD, _LEFT = 0.3, 0.4  # spacings that a point of the input may lie off, on th
 _MOST_MENDS = 8
 _MOST_REVERTS = 3
 _BENT_DEG = 20  # of edges along which points are held
-_MOST_PARTS = 1000
 _MOST_GROWTH = 16  # times the vertices wanted and given; sound meshes stay below twice
 
 
@@ -113,13 +112,11 @@ class _Mesh:
             if not done:
                 self._grow()
 
-    def collapse(self, shortest, longest, least=0.2):
-        count = _edges.collapse_short(
-            *self._tables(), self.kind, self.points, self.flat, self.n_faces,
-            shortest, longest, least,
-        )  # fmt: skip
+    def collapse(self, shortest, longest):
+        _edges.collapse_short(
+            *self._tables(), self.kind, self.points, self.flat, self.n_faces, shortest, longest
+        )
         self._compact()
-        return count
 
     def collapse_of(self, faces):
         _edges.collapse_of(*self._tables(), self.kind, self.points, self.flat, faces)
@@ -153,7 +150,7 @@ class _Mesh:
     def smooth(self, reach):
         """Move vertices within the surface; returns the face and weights of each on the input."""
         step = np.zeros((self.n_vertices, 3))
-        _edges.relax(*self._tables(), self.kind, self.points, self.n_vertices, step)
+        _moves.relax(*self._tables(), self.kind, self.points, self.n_vertices, step)
         return self.settle(step, reach)
 
     def settle(self, step, reach):
@@ -174,14 +171,14 @@ class _Mesh:
                     self.flat[stay], self.kind[stay], self.place[stay], self.along[stay]
                 )
             keep = np.zeros(n, np.uint8)
-            if not _edges.folded(
+            if not _moves.folded(
                 self.corner, self.n_faces, self.flat, self.place, nearest, place, self.normals, keep
             ):
                 break
             stay = np.flatnonzero(keep)
         self.place[:n], self.along[:n], self.flat[:n] = place, along, nearest
         self.points[:n] = self.source.lift(place, weights)
-        _edges.name_origins(self.corner, self.n_faces, self.kind, self.place, self.origin)
+        _moves.name_origins(self.corner, self.n_faces, self.kind, self.place, self.origin)
         return place, weights
 
     def _project(self, wanted, kind, place, along):
@@ -333,22 +330,18 @@ class _Held:
 
     def __init__(self, source, lines, spacing):
         start, end = half_edges(source.faces)
-        half = np.arange(len(start))
         angle = edge_normals_angle(source.vertices, source.faces, source.opposite)
         angle[lines.half] = 0
-        sharp = (half > source.opposite) & (angle > np.deg2rad(_BENT_DEG))
-        length = np.linalg.norm(source.vertices[end] - source.vertices[start], axis=1)
-        parts = np.where(sharp, np.minimum(2 * length / spacing, _MOST_PARTS).astype(int), 0)
-        first = np.empty(len(source.vertices), np.int64)
-        first[start] = half
-        along = np.repeat(half, parts)
-        part = np.arange(len(along)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
-        share = np.r_[np.zeros(len(first)), part / (parts[along] + 1)]
-        half = np.r_[first, along]
-        self.face = (half // 3).astype(np.int32)
-        self.points = (1 - share)[:, None] * source.vertices[start[half]] + share[
-            :, None
-        ] * source.vertices[end[half]]
+        sharp = np.flatnonzero(
+            (np.arange(len(start)) > source.opposite) & (angle > np.deg2rad(_BENT_DEG))
+        )
+        along, edge = points_between(
+            source.vertices[start[sharp]], source.vertices[end[sharp]], spacing / 2
+        )
+        face = np.empty(len(source.vertices), np.int64)
+        face[start] = np.arange(len(start)) // 3
+        self.points = np.concatenate([source.vertices, along])
+        self.face = np.concatenate([face, sharp[edge] // 3])
 
     def pin(self, mesh, bound, spacing):
         """Pin a vertex to each held point that lies farther from the mesh than `bound`."""
