@@ -11,6 +11,44 @@ _ROUNDING = 4e-6
 _SHORTER = 1e-5
 
 
+@njit(cache=True, nogil=True, inline="always")
+def filter_offset(table, u):
+    """Offset in a pixel where the film's filter has the integral u; see `camera.filter_table`."""
+    last = len(table) - 1
+    i = min(int(u * last), last - 1)
+    return table[i] + (u * last - i) * (table[i + 1] - table[i])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def film_ray(
+    x, y, film_width, film_height, position, axes, extent, perspective, ray, origins, directions
+):
+    """Fill the origin and the direction of a ray through the place (x, y) of the film, in pixels."""
+    right = (x / film_width * 2.0 - 1.0) * extent[0]
+    up = (1.0 - y / film_height * 2.0) * extent[1]
+    length = np.sqrt(1.0 + right * right + up * up)
+    for k in range(3):
+        if perspective:
+            origins[ray, k] = position[k]
+            directions[ray, k] = (axes[2, k] + right * axes[0, k] + up * axes[1, k]) / length
+        else:
+            origins[ray, k] = position[k] + right * axes[0, k] + up * axes[1, k]
+            directions[ray, k] = axes[2, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def face_edges(vertices, faces, f):
+    """Edges u and v of face f from its first vertex, and u x v, as nine numbers."""
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    ux = vertices[b, 0] - vertices[a, 0]
+    uy = vertices[b, 1] - vertices[a, 1]
+    uz = vertices[b, 2] - vertices[a, 2]
+    vx = vertices[c, 0] - vertices[a, 0]
+    vy = vertices[c, 1] - vertices[a, 1]
+    vz = vertices[c, 2] - vertices[a, 2]
+    return ux, uy, uz, vx, vy, vz, uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
 @njit(cache=True, nogil=True)
 def camera_rays(
     x0, y0, width, height, film_width, film_height, rows, cols, table, seed,
@@ -18,7 +56,6 @@ def camera_rays(
 ):  # fmt: skip
     """Stratified rays of a rectangle of pixels, pixel by pixel: fills origins and directions (rays, 3) float64."""
     samples = rows * cols
-    last = len(table) - 1
     for y in range(height):
         for x in range(width):
             pixel = (y0 + y) * film_width + x0 + x
@@ -29,23 +66,11 @@ def camera_rays(
                 if samples > 1:
                     u = (s % cols + uniform(seed, pixel * samples + s, 0)) / cols
                     v = (s // cols + uniform(seed, pixel * samples + s, 1)) / rows
-                i = min(int(u * last), last - 1)
-                j = min(int(v * last), last - 1)
-                dx = table[i] + (u * last - i) * (table[i + 1] - table[i])
-                dy = table[j] + (v * last - j) * (table[j + 1] - table[j])
-                right = ((x0 + x + 0.5 + dx) / film_width * 2.0 - 1.0) * extent[0]
-                up = (1.0 - (y0 + y + 0.5 + dy) / film_height * 2.0) * extent[1]
-                if perspective:
-                    length = np.sqrt(1.0 + right * right + up * up)
-                    for k in range(3):
-                        origins[ray, k] = position[k]
-                        directions[ray, k] = (
-                            axes[2, k] + right * axes[0, k] + up * axes[1, k]
-                        ) / length
-                else:
-                    for k in range(3):
-                        origins[ray, k] = position[k] + right * axes[0, k] + up * axes[1, k]
-                        directions[ray, k] = axes[2, k]
+                film_ray(
+                    x0 + x + 0.5 + filter_offset(table, u), y0 + y + 0.5 + filter_offset(table, v),
+                    film_width, film_height, position, axes, extent, perspective,
+                    ray, origins, directions,
+                )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -115,15 +140,7 @@ def surface_points(
         a = faces[f, 0]
         b = faces[f, 1]
         c = faces[f, 2]
-        ux = vertices[b, 0] - vertices[a, 0]
-        uy = vertices[b, 1] - vertices[a, 1]
-        uz = vertices[b, 2] - vertices[a, 2]
-        vx = vertices[c, 0] - vertices[a, 0]
-        vy = vertices[c, 1] - vertices[a, 1]
-        vz = vertices[c, 2] - vertices[a, 2]
-        gx = uy * vz - uz * vy
-        gy = uz * vx - ux * vz
-        gz = ux * vy - uy * vx
+        ux, uy, uz, vx, vy, vz, gx, gy, gz = face_edges(vertices, faces, f)
         dx = directions[ray, 0]
         dy = directions[ray, 1]
         dz = directions[ray, 2]

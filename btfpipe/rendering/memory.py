@@ -12,7 +12,8 @@ from btfpipe.errors import InputError, amount
 from btfpipe.rendering import objects
 from btfpipe.rendering.description import naming_entry
 from btfpipe.rendering.environment import KEPT_PIXEL_BYTES, PIXEL_BYTES
-from btfpipe.rendering.footprint import MOST_TEXTURE_RAYS, PROBES
+from btfpipe.rendering.footprint import PROBES
+from btfpipe.rendering.footprint_kernels import MOST_TEXTURE_RAYS
 from btfpipe.rendering.renderer import LAYERS, tile_side
 
 PROCESS_BYTES = 120 << 20  # Python, its libraries and compiled kernels

@@ -5,13 +5,11 @@ import numpy as np
 from btfpipe.parallel import ordered_map, single_threaded_blas
 from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
-from btfpipe.rendering.footprint import (
-    Footprints,
+from btfpipe.rendering.footprint import Footprints, filter_variance, strata_parts
+from btfpipe.rendering.footprint_kernels import (
     count_texture_rays,
     film_offsets,
     film_steps,
-    filter_variance,
-    strata_parts,
     texture_rays,
 )
 
@@ -249,7 +247,7 @@ class Renderer:
         return tuple(a[:n] for a in (row, col, at_i, at_o, blend, target, corner))
 
     def _steps(self, points, prim, directions):
-        """Steps on the tangent planes of points; see `footprint.film_steps`."""
+        """Steps on the tangent planes of points; see `footprint_kernels.film_steps`."""
         film, camera = self.scene.film, self.scene.camera
         over = np.empty((len(points.hits), 3)), np.empty((len(points.hits), 3))
         film_steps(
