@@ -1,15 +1,22 @@
 """Shading from a coded Model: blend the roots' factors of the texels and pairs around a query, multiply, square."""
 
+import itertools
+
 import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.coded import roots_of
-from btfpipe.compression.light_slices import LightSlices, slice_bytes
-from btfpipe.compression.root_blending import RootTables, RootWeights, texel_gain
-from btfpipe.sample.shading import PairShader, corners
+from btfpipe.compression.light_slices import AveragedSlices, LightSlices, slice_bytes
+from btfpipe.compression.root_blending import RootTables, RootWeights, ValueWeights, texel_gain
+from btfpipe.parallel import blocks
+from btfpipe.sample.shading import PairShader, PairWeights, corners
 
 MANY_LIGHTS = 5  # as measured, at 1 to 4 pixels a texel (even at 3.6 to 6.2)
 _BATCH = 8  # queries at a time: their factors and those of nine pairs (18 + 16 kB at 512 terms) share the nearest cache
+_GAUSS = np.float32(
+    0.5 - 12**-0.5
+)  # of a texel from its middle: the Gauss points of its four quarters' cells
+_TEXELS = 1024  # whose roots are made at a time
 _FAST = {"contract", "reassoc", "nsz"}
 
 
@@ -36,9 +43,11 @@ class CodedShader(PairShader):
         tables = root_tables(model)
         self.products = tables.texels
         self.pairs = RootWeights(model, interpolation, tables, self.angular)
+        self.mean_pairs = ValueWeights(self.pairs, PairWeights(model, interpolation))
         if self.pairs.near is None:
             self.many_lights = MANY_LIGHTS
             self.slice_bytes = slice_bytes(len(self.pairs.roots))
+            self.slice_shape = len(self.pairs.roots), 3
 
     def shade(self, row, col, w_i, w_o, out):
         """Fill `out`; see `Appearance.shader`."""
@@ -52,9 +61,57 @@ class CodedShader(PairShader):
                 row[part], col[part], pair, weight, local, roots, gain, texel, bilinear, out[part],
             )  # fmt: skip
 
+    def add_means(self, row, col, weight, owner, w_i, w_o, out):
+        """Add weighted values at (p,) coordinates to rows of `out` (m, 3) float32.
+
+        `owner` (p,) int64, ascending, has the row of each; all coordinates of a row share its light and view, of `w_i` and
+        `w_o` (m, 3): what these pairs show is blended once for all.
+        """
+        local = np.empty(self.texture.shape[1], np.float32)
+        blended = np.empty((3, self.texture.shape[1]), np.float32)
+        texel, bilinear = np.empty(4, np.int64), np.empty(4, np.float32)
+        rows = slice(int(owner[0]), int(owner[-1]) + 1)
+        for part, pair, share in self.pairs.blocks(w_i[rows], w_o[rows]):
+            first, last = rows.start + part.start, rows.start + part.stop
+            some = slice(*np.searchsorted(owner, [first, last]))
+            _add_means(
+                self.texture, *self.angular, self.colour, self.products, self.rows, self.cols, self.toroidal,
+                row[some], col[some], weight[some], owner[some] - first, pair, share, local, blended, texel, bilinear,
+                out[first:last],
+            )  # fmt: skip
+
     def slices(self, row, col, w_o):
         """See `Appearance.shader`."""
         return LightSlices(self, row, col, w_o)
+
+    def averaged_slices(self, values, spread):
+        """Slices of averages; see `AveragedSlices`."""
+        return AveragedSlices(self.pairs, self.mean_pairs, values, spread)
+
+    def area_pictures(self, pairs):
+        """Pictures (n, texels, 3) float32 of some pairs, as bright as what is shown all over the texels' areas.
+
+        Blended roots are not, pair by pair. Four points of an area (Gauss) are enough for squares.
+        """
+        row, col = np.divmod(np.arange(self.rows * self.cols, dtype=np.float32), self.cols)
+        angular = [a[pairs] for a in self.angular]
+        out = np.empty((len(angular[0]), len(row), 3), np.float32)
+        wanted = np.zeros((len(out), 3))
+        for down, right in itertools.product((-_GAUSS, _GAUSS), repeat=2):
+            for some in blocks(len(row), _TEXELS):
+                local = np.empty((len(row[some]), self.texture.shape[1]), np.float32)
+                _blend_all(
+                    self.texture, self.products, self.rows, self.cols, self.toroidal, row[some] + down,
+                    col[some] + right, np.empty(4, np.int64), np.empty(4, np.float32), local,
+                )  # fmt: skip
+                roots = roots_of(local, angular, self.colour)
+                wanted += np.square(roots).sum(axis=0) / 4
+        for some in blocks(len(row), _TEXELS):
+            roots = roots_of(self.texture[some], angular, self.colour)
+            out[:, some] = (roots * np.abs(roots)).transpose(1, 0, 2)
+        found = np.abs(out).sum(axis=1, dtype=np.float64)
+        out *= (wanted / np.maximum(found, 1e-30))[:, None]
+        return out
 
     def seen(self, texels, view):
         """Roots (n, lights, 3) float32 of texels (n,) from a measured view under every measured light."""
@@ -135,6 +192,19 @@ def _blend(a, b, c, d, weight, out):
         out[k] = (s * a[k] + t * b[k]) + (u * c[k] + v * d[k])
 
 
+@leaf
+def _blend_all(texture, products, rows, cols, toroidal, row, col, texel, bilinear, out):
+    """Fill `out` (n, terms) with the factors at coordinates (n,), the gain inside."""
+    for q in range(len(row)):
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
+        gain = np.float32(texel_gain(products, texel, bilinear))
+        for k in range(4):
+            bilinear[k] *= gain
+        _blend(
+            texture[texel[0]], texture[texel[1]], texture[texel[2]], texture[texel[3]], bilinear, out[q]
+        )  # fmt: skip
+
+
 @leaf(fastmath=_FAST)
 def _shade(
     texture, first, second, third, colour, products, rows, cols, toroidal, row, col, pair, weight, local, roots, gain,
@@ -167,3 +237,50 @@ def _multiply(local, angular, pair, weight, start, count, roots, c):
     """Fill column `c` of `roots` for `count` queries from `start` on."""
     for i in range(count):
         roots[i, c] = _product(local[i], angular, pair[start + i], weight[start + i])
+
+
+@leaf(fastmath=_FAST)
+def _add_means(
+    texture, first, second, third, colour, products, rows, cols, toroidal, row, col, weight, owner, pair, share, local,
+    blended, texel, bilinear, out,
+):  # fmt: skip
+    at = -1
+    for p in range(len(row)):
+        q = owner[p]
+        if q != at:
+            at = q
+            _blend_pairs(first, pair[q], share[q], blended[0])
+            _blend_pairs(second, pair[q], share[q], blended[1])
+            _blend_pairs(third, pair[q], share[q], blended[2])
+        corners(float(row[p]), float(col[p]), rows, cols, toroidal, texel, bilinear)
+        _blend(
+            texture[texel[0]], texture[texel[1]], texture[texel[2]], texture[texel[3]], bilinear, local
+        )  # fmt: skip
+        gain = np.float32(texel_gain(products, texel, bilinear))
+        x = gain * _dot(local, blended[0], first.shape[1])
+        y = gain * _dot(local, blended[1], second.shape[1])
+        z = gain * _dot(local, blended[2], third.shape[1])
+        for c in range(3):
+            root = colour[c, 0] * x + colour[c, 1] * y + colour[c, 2] * z
+            out[q, c] += weight[p] * root * abs(root)
+
+
+@leaf(fastmath=_FAST)
+def _blend_pairs(angular, pair, weight, out):
+    """Fill ``out``, as far as there are terms, with the blended factors of some pairs."""
+    n = angular.shape[1]
+    for k in range(n):
+        out[k] = np.float32(0)
+    for p in range(len(pair)):
+        row = angular[pair[p]]
+        w = weight[p]
+        for k in range(n):
+            out[k] += w * row[k]
+
+
+@leaf(fastmath=_FAST)
+def _dot(a, b, n):
+    total = np.float32(0)
+    for k in range(n):
+        total += a[k] * b[k]
+    return total

@@ -31,7 +31,6 @@ class HarmonicsShader:
     """
 
     many_lights = MANY_LIGHTS
-    linear_slices = True  # may be averaged
 
     def __init__(self, model):
         self.rows, self.cols = model.shape
@@ -43,6 +42,7 @@ class HarmonicsShader:
         self.minimum = np.array(model.minimum, np.float32).reshape(3, all_terms)
         self.step = model.step().reshape(3, all_terms)
         self.slice_bytes = slice_bytes(model.light_terms)
+        self.slice_shape = 3, model.light_terms
         self.least_view, self.least_light = (
             least_cosine(d) for d in (model.view_directions, model.light_directions)
         )
@@ -66,6 +66,13 @@ class HarmonicsShader:
     def slices(self, row, col, w_o):
         """See `Appearance.shader`."""
         return HarmonicSlices(self, row, col, w_o)
+
+    def averaged_slices(self, values, spread):
+        """Slices whose `values` are averages; they are linear, however far texels spread."""
+        no = np.empty((0, 3), np.float32)
+        slices = HarmonicSlices(self, no[:, 0], no[:, 1], no)
+        slices.values = values
+        return slices
 
 
 def slice_bytes(light_terms):

@@ -3,6 +3,8 @@
 At one texel and from one view a BTF is a function of the light alone: a slice of it. A slice under all measured lights
 costs what some single lights do, less where look-ups share texels; each further light then only interpolates. What is
 interpolated is square roots of values (`btfpipe.compression.root_blending`).
+
+Slices of values can be averaged over what a look-up covers of the sample, those of roots cannot.
 """
 
 import numpy as np
@@ -55,6 +57,11 @@ class LightSlices:
                 _add(seen, texel, bilinear, lookup, weight.ravel()[some], number, self.roots)
                 number[texels] = -1
 
+    @property
+    def values(self):
+        """What the look-ups show under the measured lights (n, lights, 3) float32."""
+        return self.roots * np.abs(self.roots)
+
     def shade(self, chosen, w_i, out):
         """Values of some look-ups under lights of theirs.
 
@@ -70,6 +77,31 @@ class LightSlices:
         light, weight = np.zeros((len(chosen), 4), np.int32), np.zeros((len(chosen), 4))
         self.pairs.find_lights(w_i, light, weight)
         _interpolate(self.roots, chosen, light, weight, out)
+
+
+class AveragedSlices:
+    """Slices of look-ups of which many are averages over several texels.
+
+    Parameters
+    ----------
+    pairs : RootWeights
+    means : ValueWeights
+    values : (n, lights, 3) float32
+        Under the measured lights.
+    spread : (n,) float32
+        1 for an average, between whose lights values are blended; 0 for a point, as in `LightSlices`.
+    """
+
+    def __init__(self, pairs, means, values, spread):
+        self.pairs, self.means = pairs, means
+        self.values, self.spread = values, spread
+
+    def shade(self, chosen, w_i, out):
+        """Fill `out`; see `LightSlices.shade`."""
+        light, weight = np.zeros((len(chosen), 4), np.int32), np.zeros((2, len(chosen), 4))
+        self.pairs.find_lights(w_i, light, weight[0])
+        self.means.find_lights(w_i, light, weight[1])
+        _interpolate_means(self.values, self.spread, chosen, light, *weight, out)
 
 
 def slice_bytes(lights):
@@ -135,3 +167,18 @@ def _interpolate(roots, chosen, light, weight, out):
         out[q, 0] = red * abs(red)
         out[q, 1] = green * abs(green)
         out[q, 2] = blue * abs(blue)
+
+
+@leaf
+def _interpolate_means(values, spread, chosen, light, of_roots, of_values, out):
+    for q in range(len(chosen)):
+        share = spread[chosen[q]]
+        for c in range(3):
+            root = np.float32(0)
+            mean = np.float32(0)
+            for k in range(light.shape[1]):
+                value = values[chosen[q], light[q, k], c]
+                mean += np.float32(of_values[q, k]) * value
+                if share < 1.0:
+                    root += np.float32(of_roots[q, k] * np.copysign(np.sqrt(abs(value)), value))
+            out[q, c] = share * mean + (np.float32(1) - share) * root * abs(root)

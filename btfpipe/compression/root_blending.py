@@ -9,6 +9,9 @@ blended with weights that are a little larger:
 - Between lights, and between views, half of that (the square root of the factor): blended *values*
   are too bright there, as they show a highlight or a lit yarn at two places instead of one between.
 
+Averages of many texels, as texture filtering takes them, are averages of *values*. Between lights and
+views values are then blended, with weights that make them on the whole what blended roots are.
+
 The factors come from scalar products of the roots, summed over all pairs or all texels. The SVD's
 factors are orthogonal to each other, so that such a sum is one over the terms.
 """
@@ -159,12 +162,11 @@ class RootWeights(PairWeights):
         super().__init__(appearance, interpolation)
         self.roots = np.sqrt(self.inverse_cosines)
         self.tables = tables
-        if self.near is not None:
-            self.angular = angular
-            self.power = np.zeros(appearance.n_pairs, np.float32)
-            for part in angular:
-                for some in blocks(len(part), _QUERIES):
-                    self.power[some] += np.square(part[some]) @ tables.importance[: part.shape[1]]
+        self.angular = angular
+        self.power = np.zeros(appearance.n_pairs, np.float32)
+        for part in angular:
+            for some in blocks(len(part), _QUERIES):
+                self.power[some] += np.square(part[some]) @ tables.importance[: part.shape[1]]
 
     def find_lights(self, w_i, light, weight):
         """Fill `light`, `weight` (n, 4) for lights (n, 3): of roots, cosine and gain inside."""
@@ -203,6 +205,67 @@ class RootWeights(PairWeights):
                 pair, blended, weight,
             )  # fmt: skip
             yield part, pair, weight
+
+
+class ValueWeights:
+    """Finds the pairs of which values, averaged over texels, are blended, and their weights.
+
+    The mean over the whole sample is that of blended roots: exactly in `blocks`; in `find_lights` and `find_views` on
+    the average of all views and of all lights.
+
+    Parameters
+    ----------
+    roots : RootWeights
+    plain : PairWeights
+        Of the same pairs.
+    """
+
+    def __init__(self, roots, plain):
+        self._roots, self._plain = roots, plain
+        self.inverse_cosines = plain.inverse_cosines
+
+    def find_lights(self, w_i, light, weight):
+        """Fill `light`, `weight` (n, 4) for lights (n, 3), the cosine inside."""
+        find(self._roots.lights, w_i, light, weight)
+        _weigh_values(self._roots.tables.lights, light, weight)
+        weight *= self.inverse_cosines[light] * np.maximum(w_i[:, 2:], 0)
+
+    def find_views(self, w_o, view, weight):
+        """Fill `view`, `weight` (n, 4) for views (n, 3)."""
+        find(self._roots.views, w_o, view, weight)
+        _weigh_values(self._roots.tables.views, view, weight)
+
+    def blocks(self, w_i, w_o):
+        """See `PairWeights.blocks`."""
+        roots, tables = self._roots, self._roots.tables
+        blended = np.empty(len(tables.importance), np.float32)
+        both = zip(self._plain.blocks(w_i, w_o), roots.blocks(w_i, w_o), strict=True)
+        for (part, pair, weight), (_, _, of_roots) in both:
+            _match(*roots.angular, tables.importance, roots.power, pair, of_roots, blended, weight)
+            yield part, pair, weight
+
+
+@leaf
+def _weigh_values(products, index, weight):
+    for q in range(len(index)):
+        gain = _direction_gain(products, index[q], weight[q])
+        for k in range(4):
+            weight[q, k] /= gain * gain
+
+
+@leaf
+def _match(first, second, third, importance, power, pair, of_roots, blended, weight):
+    """Scale weights of values so that their mean over all texels is that of blended roots."""
+    for q in range(len(pair)):
+        kept = 0.0
+        for p in range(pair.shape[1]):
+            kept += weight[q, p] * power[pair[q, p]]
+        found = _mean_square(first, importance, pair[q], of_roots[q], blended)
+        found += _mean_square(second, importance, pair[q], of_roots[q], blended)
+        found += _mean_square(third, importance, pair[q], of_roots[q], blended)
+        share = found / kept if kept > 0.0 else 1.0
+        for p in range(pair.shape[1]):
+            weight[q, p] *= share
 
 
 @leaf

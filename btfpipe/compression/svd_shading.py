@@ -51,6 +51,20 @@ class SvdShader(PairShader):
         for part, pair, share in self.pairs.blocks(w_i, w_o):
             _shade_factors(factors[part], self.angular, pair, share, out[part])
 
+    def slice_factors(self, factors, w_o):
+        """Values (m, lights, 3) float32 of texels' factors (m, terms) from views (m, 3) under every measured light."""
+        view, weight = np.zeros((len(factors), 4), np.int32), np.zeros((len(factors), 4))
+        self.pairs.find_views(w_o, view, weight)
+        lights = len(self.pairs.inverse_cosines)
+        out = np.zeros((len(factors), lights, 3), np.float32)
+        flat = out.reshape(len(factors), -1)
+        for seen in np.unique(view[weight > 0]):
+            mine, which = np.nonzero((view == seen) & (weight > 0))
+            angular = self.angular[seen * lights : (seen + 1) * lights]
+            values = factors[mine] @ angular.reshape(3 * lights, -1).T
+            flat[mine] += weight[mine, which, None].astype(np.float32) * values
+        return out
+
 
 _FAST = {"contract", "reassoc", "nsz"}
 

@@ -23,7 +23,7 @@ from btfpipe.rendering import footprint_kernels as kernels
 
 PROBES = 1 << 14  # evaluated at a time
 _MOST_PARTS = 3  # of a stratum along each axis
-_WIDEST = 0.4  # standard deviation of a part over that of the filter
+_WIDEST = 0.3  # standard deviation of a part over that of the filter
 _STEPS = 256  # of a stratum's integrals
 
 
@@ -79,6 +79,8 @@ class Footprints:
     ----------
     target : (n,) int64
         The look-ups' points.
+    spread : (n,) float32
+        0 for a look-up that is a point, 1 for one that covers more than about a texel.
     points : bool
         Whether no look-up is more than a point: then nothing is filtered.
     """
@@ -91,31 +93,26 @@ class Footprints:
         self.first = np.empty(len(row) + 1, np.int64)
         self.row, self.col, self.weight, self.share = (np.empty(n, np.float32) for _ in range(4))
         self.level, self.count = np.empty(n, np.int16), np.empty(n, np.int16)
-        self.steps = np.empty((n, 2), np.float32)
+        self.steps, self.spread = np.empty((n, 2), np.float32), np.empty(len(row), np.float32)
         whole = [(some[0] * some[1]).sum(axis=1) for some in parts]
         divided = [(some[0] ** 2 * some[1]).sum(axis=1).mean() for some in parts]
         film = np.concatenate([[variance], [means.var() for means in whole], divided, *whole])
         self.points = not kernels.fill_footprints(
             target, corner, at_x, at_y, float(texels_per_unit), offset, stratum, *parts, film, pyramid.top,
             np.empty((8, 6)), row, col, self.first, self.row, self.col, self.weight, self.level, self.share, self.count,
-            self.steps,
+            self.steps, self.spread,
         )  # fmt: skip
 
-    @property
-    def linear_slices(self):
-        """Whether slices of the look-ups can be averaged: those of square roots cannot."""
-        return getattr(self.pyramid.level(0), "linear_slices", False)
-
-    def average(self, chosen, evaluate, out, shade_factors=None):
+    def average(self, chosen, add, out, shade_factors=None):
         """Average over the footprints of some look-ups.
 
         Parameters
         ----------
         chosen : (m,) int
             Look-ups.
-        evaluate : callable
-            ``evaluate(shader, which, row, col)`` gives values (p, ...) at coordinates (p,) of a level's shader;
-            `which` (p,) numbers them along `chosen`.
+        add : callable
+            ``add(shader, which, row, col, weight, out)`` adds weighted values at coordinates (p,) of a level's shader to `out`;
+            `which` (p,), ascending, numbers them along `chosen`.
         out : (m, ...) float32
             Filled in place.
         shade_factors : callable, optional
@@ -125,7 +122,6 @@ class Footprints:
         ends = np.empty(len(chosen), np.int64)
         kernels.count_probes(chosen, self.first, self.count, self.share, ends)
         out[:] = 0
-        flat = out.reshape(len(out), -1)
         start = 0
         while start < len(chosen):
             before = ends[start - 1] if start else 0
@@ -151,12 +147,11 @@ class Footprints:
                     touched[which - start] = True
                     last = shader
                 else:
-                    values = evaluate(shader, which, *at)
-                    kernels.add(values.reshape(len(values), -1), which, weight[some], flat)
+                    add(shader, which, *at, weight[some], out)
             if factors is not None:
                 rows = np.flatnonzero(touched)
                 values = shade_factors(last, start + rows, factors[rows])
-                kernels.add(values, start + rows, np.ones(len(rows), np.float32), flat)
+                kernels.add(_flat(values), start + rows, np.ones(len(rows), np.float32), _flat(out))
             start = stop
 
     def _coordinates(self, shader, number, row, col):
@@ -172,38 +167,49 @@ class Footprints:
     def shade(self, chosen, w_i, w_o, out):
         """Fill `out` (m, 3) float32 with what some look-ups show; see `Appearance.shader`."""
 
-        def evaluate(shader, which, row, col):
+        def add(shader, which, row, col, weight, out):
+            if hasattr(shader, "add_means"):
+                shader.add_means(row, col, weight, which, w_i, w_o, out)
+                return
             values = np.empty((len(which), 3), np.float32)
             shader.shade(row, col, w_i[which], w_o[which], values)
-            return values
+            kernels.add(values, which, weight, out)
 
         def shade_factors(shader, which, factors):
             values = np.empty((len(which), 3), np.float32)
             shader.shade_factors(factors, w_i[which], w_o[which], values)
             return values
 
-        self.average(chosen, evaluate, out, shade_factors)
+        self.average(chosen, add, out, shade_factors)
 
     def slices(self, w_o):
         """What all look-ups show whatever the light; see `Appearance.shader`."""
 
-        def evaluate(shader, which, row, col):
-            return shader.slices(row, col, w_o[which]).values
+        def add(shader, which, row, col, weight, out):
+            values = shader.slices(row, col, w_o[which]).values
+            kernels.add(_flat(values), which, weight, _flat(out))
+
+        def shade_factors(shader, which, factors):
+            return shader.slice_factors(factors, w_o[which])
 
         shader = self.pyramid.level(0)
-        whole = shader.slices(self.row[:0], self.col[:0], w_o[:0])
-        whole.values = np.empty((len(self.target), *whole.values.shape[1:]), np.float32)
-        self.average(np.arange(len(self.target)), evaluate, whole.values)
-        return whole
+        values = np.empty((len(self.target), *shader.slice_shape), np.float32)
+        self.average(np.arange(len(self.target)), add, values, shade_factors)
+        return shader.averaged_slices(values, self.spread)
 
     def shade_sky(self, sky, frames, w_o, out, visibility):
         """Fill `out` with the light of a `HarmonicEnvironment`; arguments as for its ``shade``."""
 
-        def evaluate(shader, which, row, col):
+        def add(shader, which, row, col, weight, out):
             values = np.empty((len(which), 3), np.float32)
             level = copy.copy(sky)
             level.shader = shader
             level.shade(row, col, frames[which], w_o[which], values, visibility[which])
-            return values
+            kernels.add(values, which, weight, out)
 
-        self.average(np.arange(len(self.target)), evaluate, out)
+        self.average(np.arange(len(self.target)), add, out)
+
+
+def _flat(values):
+    """Values (n, ...) as (n, k)."""
+    return values.reshape(len(values), -1)

@@ -241,12 +241,13 @@ def _covariance(rx, ry, cx, cy, across, down, out):
 @leaf
 def fill_footprints(
     target, corner, at_x, at_y, texels_per_unit, offset, stratum, parts_x, parts_y, film, top, scratch, row,
-    col, first, part_row, part_col, weight, level, share, count, steps,
+    col, first, part_row, part_col, weight, level, share, count, steps, spread,
 ):  # fmt: skip
     """List the parts of look-ups' footprints: those of look-up q from ``first[q]``; returns whether any is more than a point.
 
     `film` has the variance of the filter, those of the means of its strata and of the means of their parts, each across and down,
     and the means of the strata themselves. The arrays from `part_row` on have room for all parts; `scratch` is (8, 6).
+    `spread` (n,) says how far a look-up is from a point.
     """
     chosen, have, want, move = scratch[0], scratch[1], scratch[2], scratch[3]
     any_ = False
@@ -261,8 +262,9 @@ def fill_footprints(
         cy = texels_per_unit * at_y[q, 0]
         _covariance(rx, ry, cx, cy, film[0], film[0], want)
         middle = (want[0] + want[2]) / 2
-        spread = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
-        whole = min(max((middle + spread) / _LEAST - 1, 0.0), 1.0)
+        apart = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
+        whole = min(max((middle + apart) / _LEAST - 1, 0.0), 1.0)
+        spread[q] = whole
         most = 1
         if whole > 0.0:
             any_ = True
@@ -276,7 +278,7 @@ def fill_footprints(
                 want[1] - have[1],
                 want[2] - have[2],
                 _WIDER if corner[q] < 0 else 1.0,
-                _ROOM * (middle - spread),
+                _ROOM * (middle - apart),
                 top,
                 chosen,
             )

@@ -285,10 +285,11 @@ class Pyramid:
         from btfpipe.compression.svd import SvdModel, factorise
 
         source = self.appearance
+        make = getattr(self._levels[0], "area_pictures", source.pictures)
         level = SimpleNamespace(shape=halving.halved, n_pairs=source.n_pairs)
 
         def rows(_, pairs):
-            pictures = source.pictures(pairs)
+            pictures = make(pairs)
             pictures = halving.pictures(pictures.reshape(len(pictures), -1, 3))
             return np.ascontiguousarray(pictures.transpose(0, 2, 1)).reshape(3 * len(pictures), -1)
 
@@ -307,7 +308,9 @@ class Pyramid:
             terms *= 2
         self.facts = {"terms": facts["n_terms"], "relative_error": facts["relative_error"]}
         model = SvdModel(texture.reshape(*halving.halved, -1), angular, source)
-        return model.shader(self.interpolation)
+        shader = model.shader(self.interpolation)
+        shader.pairs = getattr(self._levels[0], "mean_pairs", shader.pairs)
+        return shader
 
 
 def _own_bytes(shader, below):

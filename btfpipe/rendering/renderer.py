@@ -155,7 +155,7 @@ class Renderer:
         row, col, _, at_o, _, target, _ = self._look_up(thing, mine, points, points.toward_eye)
         filtered = points.footprints[number]
         if filtered is not None:
-            return (filtered.slices(at_o), target) if filtered.linear_slices else None
+            return filtered.slices(at_o), target
         return self.sliced[number].slices(row, col, at_o), target
 
     def _add_light(self, light, points, slices, radiance):
@@ -180,7 +180,7 @@ class Renderer:
                 row, col, at_i, at_o, blend, target, _ = lookups
                 values = np.empty_like(at_i)
                 filtered = points.footprints[number]
-                if slices.get(number) is not None:
+                if number in slices:
                     sliced, belongs = slices[number]
                     sliced.shade(_of_points(belongs, mine, n), at_i, values)
                 elif filtered is not None:
