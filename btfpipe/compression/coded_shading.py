@@ -84,9 +84,9 @@ class CodedShader(PairShader):
         """See `Appearance.shader`."""
         return LightSlices(self, row, col, w_o)
 
-    def averaged_slices(self, values, spread):
+    def averaged_slices(self, values, w_o, spread):
         """Slices of averages; see `AveragedSlices`."""
-        return AveragedSlices(self.pairs, self.mean_pairs, values, spread)
+        return AveragedSlices(self.pairs, self.mean_pairs, values, w_o, spread)
 
     def area_pictures(self, pairs):
         """Pictures (n, texels, 3) float32 of some pairs, as bright as what is shown all over the texels' areas.

@@ -67,8 +67,8 @@ class HarmonicsShader:
         """See `Appearance.shader`."""
         return HarmonicSlices(self, row, col, w_o)
 
-    def averaged_slices(self, values, spread):
-        """Slices whose `values` are averages; they are linear, however far texels spread."""
+    def averaged_slices(self, values, w_o, spread):
+        """Slices whose `values` are averages; they are linear, whatever the views and however far texels spread."""
         no = np.empty((0, 3), np.float32)
         slices = HarmonicSlices(self, no[:, 0], no[:, 1], no)
         slices.values = values

@@ -11,6 +11,7 @@ import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.root_blending import texel_gain
+from btfpipe.directions.interpolation import find
 from btfpipe.parallel import blocks
 from btfpipe.sample.shading import corners
 
@@ -88,19 +89,22 @@ class AveragedSlices:
     means : ValueWeights
     values : (n, lights, 3) float32
         Under the measured lights.
+    w_o : (n, 3) float32
     spread : (n,) float32
         1 for an average, between whose lights values are blended; 0 for a point, as in `LightSlices`.
     """
 
-    def __init__(self, pairs, means, values, spread):
+    def __init__(self, pairs, means, values, w_o, spread):
         self.pairs, self.means = pairs, means
         self.values, self.spread = values, spread
+        self.view, self.share = np.zeros((len(w_o), 4), np.int32), np.zeros((len(w_o), 4))
+        find(pairs.views, w_o, self.view, self.share)
 
     def shade(self, chosen, w_i, out):
         """Fill `out`; see `LightSlices.shade`."""
         light, weight = np.zeros((len(chosen), 4), np.int32), np.zeros((2, len(chosen), 4))
         self.pairs.find_lights(w_i, light, weight[0])
-        self.means.find_lights(w_i, light, weight[1])
+        self.means.find_lights(w_i, self.view[chosen], self.share[chosen], light, weight[1])
         _interpolate_means(self.values, self.spread, chosen, light, *weight, out)
 
 

@@ -24,6 +24,7 @@ from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.shading import PairWeights
 
 _QUERIES = 8192  # whose pairs are listed at a time
+_LARGEST = 1 << 24  # scalar products kept, 64 MB
 _MOST = 16.0  # of a factor: as many directions as are ever blended, of which only one is lit
 
 
@@ -47,6 +48,8 @@ class RootTables:
     lights, views : (n, n) float64
         Scalar products of the roots of value / cos(theta_i) under each light and from each view;
         only of a full grid.
+    lights_by_view, views_by_light : (m, n, n) float32
+        The same view by view and light by light; m is 1, and they are the mean of all, where there are very many.
     importance : (n,) float32
         Sum of the squares of each term over the texels.
     """
@@ -63,27 +66,41 @@ class RootTables:
         self.texels = np.empty((texture.shape[0] * texture.shape[1], 5), np.float32)
         _multiply_neighbours(texture, power, self.texels)
         if appearance.is_product:
-            self.lights, self.views = _direction_products(angular, self.importance, appearance)
+            self.lights_by_view, self.views_by_light = _direction_products(
+                angular, self.importance, appearance
+            )
+            self.lights = self.lights_by_view.sum(axis=0, dtype=np.float64)
+            self.views = self.views_by_light.sum(axis=0, dtype=np.float64)
 
 
 def _direction_products(angular, importance, appearance):
-    """Scalar products (lights, lights) and (views, views) of the roots of value / cos(theta_i)."""
+    """Scalar products (views, lights, lights) and (lights, views, views) of the roots of value / cos(theta_i)."""
     from btfpipe.sample.appearance import light_cosines
 
     lights, views = len(appearance.light_directions), len(appearance.view_directions)
     scale = np.sqrt(1 / light_cosines(appearance.light_directions)).astype(np.float32)
-    out = np.zeros((lights, lights)), np.zeros((views, views))
+    whole = product_tables(views, lights) == (views, lights)
+    by_view = np.zeros(
+        (views if whole else 1, lights, lights), np.float64 if not whole else np.float32
+    )
+    by_light = np.zeros((lights if whole else 1, views, views), by_view.dtype)
     with single_threaded_blas():
         for part in angular:
             part = part.reshape(views, lights, -1)
             each = np.sqrt(importance[: part.shape[2]])
-            for seen in part:
+            for number, seen in enumerate(part):
                 scaled = seen * each * scale[:, None]
-                out[0][:] += scaled @ scaled.T
+                by_view[number if whole else 0] += scaled @ scaled.T
             for light in range(lights):
                 scaled = part[:, light] * each * scale[light]
-                out[1][:] += scaled @ scaled.T
-    return out
+                by_light[light if whole else 0] += scaled @ scaled.T
+    return by_view, by_light
+
+
+def product_tables(views, lights):
+    """How many tables of scalar products are kept: one for each view and for each light, or one each for very many."""
+    whole = views * lights * (views + lights) <= _LARGEST
+    return (views, lights) if whole else (1, 1)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
@@ -135,13 +152,20 @@ def _factor(kept, blended):
 @leaf
 def _direction_gain(products, index, weight):
     """What the blended roots of some directions are multiplied by."""
+    kept, blended = _squares(products, index, weight)
+    return np.sqrt(np.sqrt(_factor(kept, blended)))
+
+
+@leaf
+def _squares(products, index, weight):
+    """Blended squares of the roots of some directions, and the square of the blended ones."""
     kept = 0.0
     blended = 0.0
     for i in range(len(index)):
         kept += weight[i] * products[index[i], index[i]]
         for j in range(len(index)):
             blended += weight[i] * weight[j] * products[index[i], index[j]]
-    return np.sqrt(np.sqrt(_factor(kept, blended)))
+    return kept, blended
 
 
 class RootWeights(PairWeights):
@@ -210,8 +234,8 @@ class RootWeights(PairWeights):
 class ValueWeights:
     """Finds the pairs of which values, averaged over texels, are blended, and their weights.
 
-    The mean over the whole sample is that of blended roots: exactly in `blocks`; in `find_lights` and `find_views` on
-    the average of all views and of all lights.
+    The mean over the whole sample is that of blended roots: exactly in `blocks`, and in `find_lights` and `find_views` from measured
+    views and under measured lights.
 
     Parameters
     ----------
@@ -224,16 +248,18 @@ class ValueWeights:
         self._roots, self._plain = roots, plain
         self.inverse_cosines = plain.inverse_cosines
 
-    def find_lights(self, w_i, light, weight):
-        """Fill `light`, `weight` (n, 4) for lights (n, 3), the cosine inside."""
+    def find_lights(self, w_i, view, share, light, weight):
+        """Fill `light`, `weight` (n, 4) for lights (n, 3) and views (n, 4) of such a share, the cosine inside."""
+        tables = self._roots.tables
         find(self._roots.lights, w_i, light, weight)
-        _weigh_values(self._roots.tables.lights, light, weight)
+        _weigh_values(tables.lights, tables.lights_by_view, view, share, light, weight)
         weight *= self.inverse_cosines[light] * np.maximum(w_i[:, 2:], 0)
 
-    def find_views(self, w_o, view, weight):
-        """Fill `view`, `weight` (n, 4) for views (n, 3)."""
+    def find_views(self, w_o, view, weight, scale):
+        """Fill `view`, `weight` (n, 4) for views (n, 3), and `scale` (n, lights) with what values under each light are scaled by."""
+        tables = self._roots.tables
         find(self._roots.views, w_o, view, weight)
-        _weigh_values(self._roots.tables.views, view, weight)
+        _scale_values(tables.views, tables.views_by_light, view, weight, scale)
 
     def blocks(self, w_i, w_o):
         """See `PairWeights.blocks`."""
@@ -246,11 +272,31 @@ class ValueWeights:
 
 
 @leaf
-def _weigh_values(products, index, weight):
-    for q in range(len(index)):
-        gain = _direction_gain(products, index[q], weight[q])
+def _value_scale(whole, products, index, weight):
+    """Mean of blended roots' squares over that of blended values; the roots' gain is that of the `whole`."""
+    gain = _direction_gain(whole, index, weight)
+    kept, blended = _squares(products, index, weight)
+    return gain * gain * blended / kept if kept > 0.0 else 1.0
+
+
+@leaf
+def _weigh_values(whole, by_view, view, share, light, weight):
+    for q in range(len(light)):
+        scale = 0.0
         for k in range(4):
-            weight[q, k] /= gain * gain
+            if share[q, k] > 0.0:
+                table = by_view[min(np.int64(view[q, k]), len(by_view) - 1)]
+                scale += share[q, k] * _value_scale(whole, table, light[q], weight[q])
+        for k in range(4):
+            weight[q, k] *= scale
+
+
+@leaf
+def _scale_values(whole, by_light, view, weight, scale):
+    for q in range(len(view)):
+        for light in range(scale.shape[1]):
+            table = by_light[min(light, len(by_light) - 1)]
+            scale[q, light] = _value_scale(whole, table, view[q], weight[q])
 
 
 @leaf

@@ -53,9 +53,10 @@ class SvdShader(PairShader):
 
     def slice_factors(self, factors, w_o):
         """Values (m, lights, 3) float32 of texels' factors (m, terms) from views (m, 3) under every measured light."""
-        view, weight = np.zeros((len(factors), 4), np.int32), np.zeros((len(factors), 4))
-        self.pairs.find_views(w_o, view, weight)
         lights = len(self.pairs.inverse_cosines)
+        view, weight = np.zeros((len(factors), 4), np.int32), np.zeros((len(factors), 4))
+        scale = np.empty((len(factors), lights), np.float32)
+        self.pairs.find_views(w_o, view, weight, scale)
         out = np.zeros((len(factors), lights, 3), np.float32)
         flat = out.reshape(len(factors), -1)
         for seen in np.unique(view[weight > 0]):
@@ -63,6 +64,7 @@ class SvdShader(PairShader):
             angular = self.angular[seen * lights : (seen + 1) * lights]
             values = factors[mine] @ angular.reshape(3 * lights, -1).T
             flat[mine] += weight[mine, which, None].astype(np.float32) * values
+        out *= scale[:, :, None]
         return out
 
 

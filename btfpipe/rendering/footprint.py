@@ -195,7 +195,7 @@ class Footprints:
         shader = self.pyramid.level(0)
         values = np.empty((len(self.target), *shader.slice_shape), np.float32)
         self.average(np.arange(len(self.target)), add, values, shade_factors)
-        return shader.averaged_slices(values, self.spread)
+        return shader.averaged_slices(values, w_o, self.spread)
 
     def shade_sky(self, sky, frames, w_o, out, visibility):
         """Fill `out` with the light of a `HarmonicEnvironment`; arguments as for its ``shade``."""
