@@ -44,7 +44,7 @@ def _bindings(context, parameter, values):
 @click.option(
     "--texture-filter/--no-texture-filter",
     default=None,
-    help="Whether Samples and Models are averaged over what a ray covers of them, instead of as the scene says (by default not).",
+    help="Whether Samples and Models are averaged over what a ray covers of them, instead of as the scene says (by default they are).",
 )
 @click.option(
     "--float",

@@ -125,16 +125,18 @@ class CodedModel(Model):
     def shading_needs(cls, reader):
         from btfpipe.compression.coded_shading import MANY_LIGHTS
         from btfpipe.compression.light_slices import slice_bytes
+        from btfpipe.compression.root_blending import product_bytes
 
         shape, terms = _sizes(reader)
         source = read_tables(reader)
         texture = 4 * math.prod(shape) * terms[0]
         angular = 4 * len(source.light_index) * sum(terms[1:])
-        shared = (0, 0)
+        products, shared = 20 * math.prod(shape), (0, 0)
         if "view_basis" in reader:
-            shared = slice_bytes(len(source.light_directions)), MANY_LIGHTS
+            lights, views = len(source.light_directions), len(source.view_directions)
+            shared = slice_bytes(lights), MANY_LIGHTS
+            products += product_bytes(lights, views)
         # each is unpacked into one array and laid out anew in another
-        products = 20 * math.prod(shape)
         levels = svd_levels(math.prod(shape), len(source.light_index))
         return ShadingNeeds(texture + angular + products, max(texture, angular), *shared, **levels)
 

@@ -24,7 +24,7 @@ from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.shading import PairWeights
 
 _QUERIES = 8192  # whose pairs are listed at a time
-_LARGEST = 1 << 24  # scalar products kept, 64 MB
+_LARGEST = 1 << 23  # scalar products kept, 64 MB
 _MOST = 16.0  # of a factor: as many directions as are ever blended, of which only one is lit
 
 
@@ -48,7 +48,7 @@ class RootTables:
     lights, views : (n, n) float64
         Scalar products of the roots of value / cos(theta_i) under each light and from each view;
         only of a full grid.
-    lights_by_view, views_by_light : (m, n, n) float32
+    lights_by_view, views_by_light : (m, n, n) float64
         The same view by view and light by light; m is 1, and they are the mean of all, where there are very many.
     importance : (n,) float32
         Sum of the squares of each term over the texels.
@@ -69,8 +69,8 @@ class RootTables:
             self.lights_by_view, self.views_by_light = _direction_products(
                 angular, self.importance, appearance
             )
-            self.lights = self.lights_by_view.sum(axis=0, dtype=np.float64)
-            self.views = self.views_by_light.sum(axis=0, dtype=np.float64)
+            self.lights = self.lights_by_view.sum(axis=0)
+            self.views = self.views_by_light.sum(axis=0)
 
 
 def _direction_products(angular, importance, appearance):
@@ -79,11 +79,9 @@ def _direction_products(angular, importance, appearance):
 
     lights, views = len(appearance.light_directions), len(appearance.view_directions)
     scale = np.sqrt(1 / light_cosines(appearance.light_directions)).astype(np.float32)
-    whole = product_tables(views, lights) == (views, lights)
-    by_view = np.zeros(
-        (views if whole else 1, lights, lights), np.float64 if not whole else np.float32
-    )
-    by_light = np.zeros((lights if whole else 1, views, views), by_view.dtype)
+    whole = _whole_tables(lights, views)
+    by_view = np.zeros((views if whole else 1, lights, lights))
+    by_light = np.zeros((lights if whole else 1, views, views))
     with single_threaded_blas():
         for part in angular:
             part = part.reshape(views, lights, -1)
@@ -97,10 +95,15 @@ def _direction_products(angular, importance, appearance):
     return by_view, by_light
 
 
-def product_tables(views, lights):
-    """How many tables of scalar products are kept: one for each view and for each light, or one each for very many."""
-    whole = views * lights * (views + lights) <= _LARGEST
-    return (views, lights) if whole else (1, 1)
+def _whole_tables(lights, views):
+    """Whether products are kept for each view and each light."""
+    return lights * views * (lights + views) <= _LARGEST
+
+
+def product_bytes(lights, views):
+    """Bytes of the products that a `RootTables` keeps."""
+    each = lights * views * (lights + views) if _whole_tables(lights, views) else 0
+    return 8 * each + 16 * (lights**2 + views**2)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
@@ -272,21 +275,17 @@ class ValueWeights:
 
 
 @leaf
-def _value_scale(whole, products, index, weight):
-    """Mean of blended roots' squares over that of blended values; the roots' gain is that of the `whole`."""
-    gain = _direction_gain(whole, index, weight)
-    kept, blended = _squares(products, index, weight)
-    return gain * gain * blended / kept if kept > 0.0 else 1.0
-
-
-@leaf
 def _weigh_values(whole, by_view, view, share, light, weight):
     for q in range(len(light)):
-        scale = 0.0
+        kept = 0.0
+        blended = 0.0
         for k in range(4):
-            if share[q, k] > 0.0:
-                table = by_view[min(np.int64(view[q, k]), len(by_view) - 1)]
-                scale += share[q, k] * _value_scale(whole, table, light[q], weight[q])
+            table = by_view[min(np.int64(view[q, k]), len(by_view) - 1)]
+            some, others = _squares(table, light[q], weight[q])
+            kept += share[q, k] * some
+            blended += share[q, k] * others
+        gain = _direction_gain(whole, light[q], weight[q])
+        scale = gain * gain * blended / kept if kept > 0.0 else 1.0
         for k in range(4):
             weight[q, k] *= scale
 
@@ -294,9 +293,11 @@ def _weigh_values(whole, by_view, view, share, light, weight):
 @leaf
 def _scale_values(whole, by_light, view, weight, scale):
     for q in range(len(view)):
+        gain = _direction_gain(whole, view[q], weight[q])
         for light in range(scale.shape[1]):
             table = by_light[min(light, len(by_light) - 1)]
-            scale[q, light] = _value_scale(whole, table, view[q], weight[q])
+            kept, blended = _squares(table, view[q], weight[q])
+            scale[q, light] = gain * gain * blended / kept if kept > 0.0 else 1.0
 
 
 @leaf

@@ -21,7 +21,7 @@ _RAY_BYTES = 530  # origin, direction, hit, point, light
 _LOOKUP_BYTES = 80  # coordinates, directions and values
 _FOOTPRINT_BYTES = 130  # of a look-up that is filtered: its strata's parts
 _PROBE_BYTES = 150  # of those evaluated at a time
-_SLICED_BYTES = 150  # of a look-up with a slice, beside the slice
+_SLICED_BYTES = 200  # of a look-up with a slice, beside the slice
 _OCCLUSION_BYTES = 48  # a ray of those that see how much of the sky is open
 _TILE_PIXEL_BYTES = 200  # sums and layers of a tile, and of finished tiles that wait for their turn
 _FILM_BYTES = 4 * len(LAYERS)  # a pixel
@@ -214,7 +214,7 @@ def _tile_bytes(film, lights, looks):
     lookup, fixed = _LOOKUP_BYTES, 0
     if film.texture_filter and looks:
         lookup, fixed = _LOOKUP_BYTES + _FOOTPRINT_BYTES, _PROBE_BYTES * PROBES
-        fixed += most * PROBES
+        fixed += 2 * most * PROBES  # slices of roots, and of values
     plain = ray + lookup * max((n for n, _ in looks), default=1)
     shared = ray + max((n * (lookup + _SLICED_BYTES + size) for n, size in sliced), default=0)
     # slices make tiles smaller, if there are any in the end

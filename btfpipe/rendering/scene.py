@@ -22,7 +22,7 @@ class Film:
     samples: int = 16
     filter: str = "gaussian"
     radius: float = 1.5
-    texture_filter: bool = False
+    texture_filter: bool = True
 
 
 @dataclass

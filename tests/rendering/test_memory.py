@@ -127,9 +127,11 @@ def test_what_is_told_beforehand_covers_the_arrays_that_shaders_hold(
     (sample if method == "sample" else compress([sample], method, **options)).save(path)
     needs = shading_needs(path)
     shader = open_appearance(path).shader()
-    held = [a for v in vars(shader).values() for a in (v if isinstance(v, list | tuple) else [v])]
-    held = [a for a in held if isinstance(a, np.ndarray) and not _is_mapped(a)]
-    private = sum(a.nbytes for a in held)
+    holders = [shader, getattr(getattr(shader, "pairs", None), "tables", None)]
+    held = [v for holder in holders if holder is not None for v in vars(holder).values()]
+    held = [a for v in held for a in (v if isinstance(v, list | tuple) else [v])]
+    held = {id(a): a for a in held if isinstance(a, np.ndarray) and not _is_mapped(a)}
+    private = sum(a.nbytes for a in held.values())
     few = 6 << 10  # steps, ends, tables of codes: not worth counting
     assert private - few <= needs.kept <= 1.1 * private + few
     assert needs.slice_bytes == getattr(shader, "slice_bytes", 0)
