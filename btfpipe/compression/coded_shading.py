@@ -1,21 +1,22 @@
 """Shading from a coded Model: blend the roots' factors of the texels and pairs around a query, multiply, square."""
 
-import itertools
-
 import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.compression.coded import roots_of
 from btfpipe.compression.light_slices import AveragedSlices, LightSlices, slice_bytes
-from btfpipe.compression.root_blending import RootTables, RootWeights, ValueWeights, texel_gain
+from btfpipe.compression.root_blending import (
+    RootTables,
+    RootWeights,
+    ValueWeights,
+    area_factors,
+    texel_gain,
+)
 from btfpipe.parallel import blocks
 from btfpipe.sample.shading import PairShader, PairWeights, corners
 
 MANY_LIGHTS = 5  # as measured, at 1 to 4 pixels a texel (even at 3.6 to 6.2)
 _BATCH = 8  # queries at a time: their factors and those of nine pairs (18 + 16 kB at 512 terms) share the nearest cache
-_GAUSS = np.float32(
-    0.5 - 12**-0.5
-)  # of a texel from its middle: the Gauss points of its four quarters' cells
 _TEXELS = 1024  # whose roots are made at a time
 _FAST = {"contract", "reassoc", "nsz"}
 
@@ -91,22 +92,15 @@ class CodedShader(PairShader):
     def area_pictures(self, pairs):
         """Pictures (n, texels, 3) float32 of some pairs, as bright as what is shown all over the texels' areas.
 
-        Blended roots are not, pair by pair. Four points of an area (Gauss) are enough for squares.
+        Blended roots are not, pair by pair.
         """
-        row, col = np.divmod(np.arange(self.rows * self.cols, dtype=np.float32), self.cols)
         angular = [a[pairs] for a in self.angular]
-        out = np.empty((len(angular[0]), len(row), 3), np.float32)
+        out = np.empty((len(angular[0]), len(self.texture), 3), np.float32)
         wanted = np.zeros((len(out), 3))
-        for down, right in itertools.product((-_GAUSS, _GAUSS), repeat=2):
-            for some in blocks(len(row), _TEXELS):
-                local = np.empty((len(row[some]), self.texture.shape[1]), np.float32)
-                _blend_all(
-                    self.texture, self.products, self.rows, self.cols, self.toroidal, row[some] + down,
-                    col[some] + right, np.empty(4, np.int64), np.empty(4, np.float32), local,
-                )  # fmt: skip
-                roots = roots_of(local, angular, self.colour)
-                wanted += np.square(roots).sum(axis=0) / 4
-        for some in blocks(len(row), _TEXELS):
+        texture = self.texture.reshape(self.rows, self.cols, -1)
+        for local in area_factors(texture, self.products, self.toroidal):
+            wanted += np.square(roots_of(local, angular, self.colour)).sum(axis=0) / 4
+        for some in blocks(len(self.texture), _TEXELS):
             roots = roots_of(self.texture[some], angular, self.colour)
             out[:, some] = (roots * np.abs(roots)).transpose(1, 0, 2)
         found = np.abs(out).sum(axis=1, dtype=np.float64)
@@ -190,19 +184,6 @@ def _blend(a, b, c, d, weight, out):
     v = weight[3]
     for k in range(len(out)):
         out[k] = (s * a[k] + t * b[k]) + (u * c[k] + v * d[k])
-
-
-@leaf
-def _blend_all(texture, products, rows, cols, toroidal, row, col, texel, bilinear, out):
-    """Fill `out` (n, terms) with the factors at coordinates (n,), the gain inside."""
-    for q in range(len(row)):
-        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, bilinear)
-        gain = np.float32(texel_gain(products, texel, bilinear))
-        for k in range(4):
-            bilinear[k] *= gain
-        _blend(
-            texture[texel[0]], texture[texel[1]], texture[texel[2]], texture[texel[3]], bilinear, out[q]
-        )  # fmt: skip
 
 
 @leaf(fastmath=_FAST)

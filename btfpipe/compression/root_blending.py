@@ -16,14 +16,20 @@ The factors come from scalar products of the roots, summed over all pairs or all
 factors are orthogonal to each other, so that such a sum is one over the terms.
 """
 
+import itertools
+
 import numpy as np
 
 from btfpipe.compiled import leaf
 from btfpipe.directions.interpolation import find
 from btfpipe.parallel import blocks, single_threaded_blas
-from btfpipe.sample.shading import PairWeights
+from btfpipe.sample.shading import PairWeights, corners
 
 _QUERIES = 8192  # whose pairs are listed at a time
+_GAUSS = np.float32(
+    0.5 - 12**-0.5
+)  # of a texel from its middle: the Gauss points of its four quarters' cells
+_AREAS = 1024  # texels whose factors are blended at a time
 _LARGEST = 1 << 23  # scalar products kept, 64 MB
 _MOST = 16.0  # of a factor: as many directions as are ever blended, of which only one is lit
 
@@ -50,8 +56,8 @@ class RootTables:
         only of a full grid.
     lights_by_view, views_by_light : (m, n, n) float64
         The same view by view and light by light; m is 1, and they are the mean of all, where there are very many.
-    importance : (n,) float32
-        Sum of the squares of each term over the texels.
+    importance, area_importance : (n,) float32
+        Sum of the squares of each term over the texels, and over the texels' areas as they are shown.
     """
 
     def __init__(self, texture, angular, appearance):
@@ -65,45 +71,78 @@ class RootTables:
                 power[: part.shape[1]] += np.square(part[some]).sum(axis=0)
         self.texels = np.empty((texture.shape[0] * texture.shape[1], 5), np.float32)
         _multiply_neighbours(texture, power, self.texels)
+        self.area_importance = np.zeros(n)
+        for local in area_factors(texture, self.texels, bool(appearance.toroidal)):
+            self.area_importance += np.square(local).sum(axis=0) / 4
+        self.area_importance = self.area_importance.astype(np.float32)
         if appearance.is_product:
-            self.lights_by_view, self.views_by_light = _direction_products(
-                angular, self.importance, appearance
+            lights, views = len(appearance.light_directions), len(appearance.view_directions)
+            self.lights, self.views = (
+                a[0] for a in _direction_products(angular, self.importance, appearance, whole=True)
             )
-            self.lights = self.lights_by_view.sum(axis=0)
-            self.views = self.views_by_light.sum(axis=0)
+            self.lights_by_view, self.views_by_light = _direction_products(
+                angular, self.area_importance, appearance, not _are_single(lights, views)
+            )
 
 
-def _direction_products(angular, importance, appearance):
-    """Scalar products (views, lights, lights) and (lights, views, views) of the roots of value / cos(theta_i)."""
+def area_factors(texture, products, toroidal):
+    """Yield factors (part of the texels, n) float32 at the four points (Gauss) that stand for texels' areas, the gain inside."""
+    rows, cols, n = texture.shape
+    flat = texture.reshape(-1, n)
+    row, col = np.divmod(np.arange(rows * cols, dtype=np.float32), np.float32(cols))
+    for down, right in itertools.product((-_GAUSS, _GAUSS), repeat=2):
+        for some in blocks(len(row), _AREAS):
+            local = np.empty((len(row[some]), n), np.float32)
+            _blend_all(
+                flat, products, rows, cols, toroidal, row[some] + down, col[some] + right,
+                np.empty(4, np.int64), np.empty(4, np.float32), local,
+            )  # fmt: skip
+            yield local
+
+
+@leaf(fastmath={"contract"})
+def _blend_all(texture, products, rows, cols, toroidal, row, col, texel, weight, out):
+    for q in range(len(row)):
+        corners(float(row[q]), float(col[q]), rows, cols, toroidal, texel, weight)
+        gain = np.float32(texel_gain(products, texel, weight))
+        a, b, c, d = texture[texel[0]], texture[texel[1]], texture[texel[2]], texture[texel[3]]
+        for k in range(out.shape[1]):
+            blended = (weight[0] * a[k] + weight[1] * b[k]) + (weight[2] * c[k] + weight[3] * d[k])
+            out[q, k] = gain * blended
+
+
+def _direction_products(angular, importance, appearance, whole):
+    """Scalar products of the roots of value / cos(theta_i): (views, lights, lights) and (lights, views, views), or of the whole (1, n, n)."""
     from btfpipe.sample.appearance import light_cosines
 
     lights, views = len(appearance.light_directions), len(appearance.view_directions)
     scale = np.sqrt(1 / light_cosines(appearance.light_directions)).astype(np.float32)
-    whole = _whole_tables(lights, views)
-    by_view = np.zeros((views if whole else 1, lights, lights))
-    by_light = np.zeros((lights if whole else 1, views, views))
+    by_view = np.zeros((1 if whole else views, lights, lights))
+    by_light = np.zeros((1 if whole else lights, views, views))
     with single_threaded_blas():
         for part in angular:
             part = part.reshape(views, lights, -1)
             each = np.sqrt(importance[: part.shape[2]])
             for number, seen in enumerate(part):
                 scaled = seen * each * scale[:, None]
-                by_view[number if whole else 0] += scaled @ scaled.T
+                by_view[0 if whole else number] += scaled @ scaled.T
             for light in range(lights):
                 scaled = part[:, light] * each * scale[light]
-                by_light[light if whole else 0] += scaled @ scaled.T
+                by_light[0 if whole else light] += scaled @ scaled.T
     return by_view, by_light
 
 
-def _whole_tables(lights, views):
-    """Whether products are kept for each view and each light."""
-    return lights * views * (lights + views) <= _LARGEST
+def _are_single(lights, views):
+    """Whether there are too many directions for a table of products for each."""
+    return lights * views * (lights + views) > _LARGEST
 
 
 def product_bytes(lights, views):
     """Bytes of the products that a `RootTables` keeps."""
-    each = lights * views * (lights + views) if _whole_tables(lights, views) else 0
-    return 8 * each + 16 * (lights**2 + views**2)
+    each = lights**2 + views**2
+    if not _are_single(lights, views):
+        each = lights * views * (lights + views)
+    return 8 * (each + lights**2 + views**2)
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
@@ -171,6 +210,15 @@ def _squares(products, index, weight):
     return kept, blended
 
 
+def pair_powers(angular, importance):
+    """Sums (pairs,) float32 of the squares of pairs' roots."""
+    out = np.zeros(len(angular[0]), np.float32)
+    for part in angular:
+        for some in blocks(len(part), _QUERIES):
+            out[some] += np.square(part[some]) @ importance[: part.shape[1]]
+    return out
+
+
 class RootWeights(PairWeights):
     """Finds the pairs of which roots are blended, and their weights.
 
@@ -190,10 +238,8 @@ class RootWeights(PairWeights):
         self.roots = np.sqrt(self.inverse_cosines)
         self.tables = tables
         self.angular = angular
-        self.power = np.zeros(appearance.n_pairs, np.float32)
-        for part in angular:
-            for some in blocks(len(part), _QUERIES):
-                self.power[some] += np.square(part[some]) @ tables.importance[: part.shape[1]]
+        if self.near is not None:
+            self.power = pair_powers(angular, tables.importance)
 
     def find_lights(self, w_i, light, weight):
         """Fill `light`, `weight` (n, 4) for lights (n, 3): of roots, cosine and gain inside."""
@@ -249,6 +295,7 @@ class ValueWeights:
 
     def __init__(self, roots, plain):
         self._roots, self._plain = roots, plain
+        self._power = pair_powers(roots.angular, roots.tables.area_importance)
         self.inverse_cosines = plain.inverse_cosines
 
     def find_lights(self, w_i, view, share, light, weight):
@@ -270,7 +317,9 @@ class ValueWeights:
         blended = np.empty(len(tables.importance), np.float32)
         both = zip(self._plain.blocks(w_i, w_o), roots.blocks(w_i, w_o), strict=True)
         for (part, pair, weight), (_, _, of_roots) in both:
-            _match(*roots.angular, tables.importance, roots.power, pair, of_roots, blended, weight)
+            _match(
+                *roots.angular, tables.area_importance, self._power, pair, of_roots, blended, weight
+            )
             yield part, pair, weight
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from btfpipe.compression import compress
+from btfpipe.compression import compress, open_appearance
 from btfpipe.directions import bonn81
 from btfpipe.rendering.pyramid import Halving, Pyramid
 from btfpipe.rendering.renderer import render
@@ -265,3 +265,62 @@ def test_levels_report_that_they_are_made(models):
     render(scene)
     assert told
     assert told[-1] == (pyramid.top, pyramid.top)
+
+
+def random_directions(n, seed=1):
+    out = np.random.default_rng(seed).normal(size=(n, 3))
+    out[:, 2] = abs(out[:, 2]) + 0.3
+    return (out / np.linalg.norm(out, axis=1)[:, None]).astype(np.float32)
+
+
+def glossy(size=12):
+    """Texels that shine, each towards its own side: between lights, views and texels roots are unlike values."""
+    lights, views = bonn81(), bonn81()[::4]
+    normal = np.random.default_rng(2).normal([0, 0, 1.5], 0.6, (size * size, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    half = lights[None] + views[:, None]
+    half /= np.linalg.norm(half, axis=2)[..., None]
+    shine = np.clip(half @ normal.T, 0, 1) ** 12 + 0.05
+    values = (lights[None, :, 2:] * shine).reshape(-1, size, size, 1) * [1, 0.8, 0.6]
+    pair = np.arange(len(values))
+    lit, seen = pair % len(lights), pair // len(lights)
+    return Sample(values.astype(np.float32), lights, views, lit, seen, toroidal=True)
+
+
+@pytest.fixture(scope="module")
+def shiny(tmp_path_factory):
+    """A `Pyramid` of `coded`."""
+    path = tmp_path_factory.mktemp("shiny") / "coded.npz"
+    compress([glossy()], "coded", ratio=4).save(path)
+    source = open_appearance(path)
+    return Pyramid(source, source.shader(), "barycentric")
+
+
+def mean_shown(pyramid, w_i, w_o):
+    """What level 0 shows on the mean (3,) all over the sample."""
+    rows, cols = pyramid.appearance.shape
+    row, col = (a.ravel().astype(np.float32) for a in np.mgrid[0:rows:0.25, 0:cols:0.25])
+    values = np.empty((len(row), 3), np.float32)
+    light, view = (np.tile(w, (len(row), 1)) for w in (w_i, w_o))
+    pyramid.level(0).shade(row, col, light, view, values)
+    return values.mean(axis=0)
+
+
+def test_levels_of_blended_roots_are_as_bright_as_what_is_shown_under_any_light(shiny):
+    lights, views = random_directions(12), random_directions(12, seed=2)
+    shown = [mean_shown(shiny, *pair) for pair in zip(lights, views, strict=True)]
+    zero, single = np.zeros(12, np.float32), np.empty((12, 3), np.float32)
+    shiny.level(shiny.top).shade(zero, zero, lights, views, single)
+    np.testing.assert_allclose(single, shown, rtol=0.01)
+
+
+def test_their_slices_are_nearly_as_bright(shiny):
+    view, lights = random_directions(6, seed=3), random_directions(12)
+    shown = [[mean_shown(shiny, w_i, w_o) for w_i in lights] for w_o in view]
+    top, base = shiny.level(shiny.top), shiny.level(0)
+    factors = np.tile(top.texture[:1], (6, 1))
+    slices = base.averaged_slices(top.slice_factors(factors, view), view, np.ones(6, np.float32))
+    found = np.empty((6, 12, 3), np.float32)
+    for number, w_i in enumerate(lights):
+        slices.shade(np.arange(6), np.tile(w_i, (6, 1)), found[:, number])
+    np.testing.assert_allclose(found.sum(axis=1), np.sum(shown, axis=1), rtol=0.02)
