@@ -42,8 +42,12 @@ data-sample: $(READY)
 	$(BIN)/btfpipe simulate data-sample/weave.yaml -o data-sample/weave.zip --force
 	$(BIN)/btfpipe simulate data-sample/cords.yaml -o data-sample/cords.zip --force
 
+# Files of tests side by side: WORKERS of them at a time, each file by one process.
+WORKERS ?= auto
+PARALLEL = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest

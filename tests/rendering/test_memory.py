@@ -173,7 +173,7 @@ def test_a_render_stays_within_the_memory_that_it_is_given(
             worn | {"model": "v.npz"},
         ],
         lights=[*LAMPS, {"type": "environment", "map": "room.exr", "lights": 12}],
-        film={"width": 640, "height": 480, "samples": 4, "texture_filter": filtered},
+        film={"width": 384, "height": 288, "samples": 4, "texture_filter": filtered},
     )
     need = refused(path)[1]
     command = ["render", path, "-o", tmp_path / "p.exr", "--memory", f"{need}M", "-t", 2, "-q"]

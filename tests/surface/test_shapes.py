@@ -123,6 +123,7 @@ def test_measured_meshes_are_kept(measured_data, name, n):
     check(name, read_mesh(measured_data / "meshes" / path), n, evenness)
 
 
+@pytest.mark.slow
 def test_a_shape_that_needs_more_vertices_is_told_how_many_and_they_do(shapes, btfpipe, tmp_path):
     vertices, faces = shapes.sphere(1)
     many = np.concatenate([vertices + np.array((3 * i, 0, 0)) for i in range(40)])
