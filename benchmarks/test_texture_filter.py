@@ -41,8 +41,8 @@ def folder(tmp_path_factory):
     return folder
 
 
-def plane(folder, model, texels, size=48, camera=None):
-    """A scene file of a plane with so many texels a pixel, or before a camera."""
+def plane(folder, model, texels, size=48, camera=None, lights=1):
+    """A scene file of a plane with so many texels a pixel, or before a camera; under one light, or more from all sides."""
     scene = {
         "camera": camera or {
             "type": "orthographic", "position": [0.013, 0.027, 5], "target": [0.013, 0.027, 0],
@@ -55,6 +55,15 @@ def plane(folder, model, texels, size=48, camera=None):
             "model": str(folder / model), "texels_per_unit": 100,
         }],
     }  # fmt: skip
+    if lights > 1:
+        rng = np.random.default_rng(3)
+        height, turn = rng.uniform(0.2, 1, lights), rng.uniform(0, 2 * np.pi, lights)
+        across = np.sqrt(1 - height**2)
+        towards = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
+        scene["lights"] = [
+            scene["lights"][0] | {"direction": d, "irradiance": [3 / lights] * 3}
+            for d in towards.tolist()
+        ]
     path = folder / "scene.yaml"
     path.write_text(yaml.safe_dump(scene))
     return path
@@ -94,15 +103,26 @@ def compare(name, path):
 def test_a_plane_from_above(folder, model):
     say("")
     for texels in TEXELS:
-        found, _ = compare(f"{model} {texels} texels a pixel", plane(folder, model, texels))
+        found, times = compare(f"{model} {texels} texels a pixel", plane(folder, model, texels))
+        assert times < 8
         assert found <= 0.02 or model != "coded.npz" or texels < 2
 
 
-@pytest.mark.parametrize("model", ["coded.npz", "svd.npz"])
-def test_a_plane_towards_the_horizon(folder, model):
+@pytest.mark.parametrize(("model", "lights"), [("coded.npz", 1), ("coded.npz", 24), ("svd.npz", 1)])
+def test_a_plane_towards_the_horizon(folder, model, lights):
     say("")
-    found, _ = compare(f"{model} horizon", plane(folder, model, 0, 64, HORIZON))
+    path = plane(folder, model, 0, 64, HORIZON, lights)
+    found, times = compare(f"{model} horizon, {lights} lights", path)
     assert found <= 0.02
+    assert times < 15
+
+
+def test_a_plane_from_above_under_many_lights(folder):
+    say("")
+    path = plane(folder, "coded.npz", 4.5, lights=24)
+    found, times = compare("coded.npz 4.5 texels a pixel, 24 lights", path)
+    assert found <= 0.02
+    assert times < 8
 
 
 def test_a_close_up_costs_nothing(folder):

@@ -81,7 +81,7 @@ class RootTables:
                 a[0] for a in _direction_products(angular, self.importance, appearance, whole=True)
             )
             self.lights_by_view, self.views_by_light = _direction_products(
-                angular, self.area_importance, appearance, not _are_single(lights, views)
+                angular, self.area_importance, appearance, _are_single(lights, views)
             )
 
 

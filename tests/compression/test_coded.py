@@ -212,6 +212,24 @@ def test_at_texels_and_measured_pairs_the_pictures_are_shaded(
     assert (expected < -0.05).mean() > 0.1
 
 
+def test_averages_are_those_of_what_is_shown(cloth, rng):
+    source = values_kept(cloth)
+    source.codes = source.codes - np.float32(0.15)  # so that some roots are negative
+    shader = compress_coded(source, 20).shader()
+    owner = np.sort(rng.integers(0, 40, 300))
+    row, col = (rng.random((2, 300)) * 24).astype(np.float32)
+    weight = rng.random(300).astype(np.float32)
+    w_i, w_o = (upward(rng, 40).astype(np.float32) for _ in range(2))
+    shown = np.empty((300, 3), np.float32)
+    shader.shade(row, col, w_i[owner], w_o[owner], shown)
+    expected = np.zeros((40, 3))
+    np.add.at(expected, owner, weight[:, None] * shown)
+    found = np.zeros((40, 3), np.float32)
+    shader.add_means(row, col, weight, owner, w_i, w_o, found)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert (shown < -0.02).mean() > 0.05
+
+
 def test_between_texels_the_mean_brightness_is_that_of_blended_values(cloth):
     model = compress_coded(cloth, 20)
     blended = values_kept(model)

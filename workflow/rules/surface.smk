@@ -11,7 +11,7 @@ rule surface:
         at("benchmarks/surface/{surface}.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(4000),
         memory=MEMORY,

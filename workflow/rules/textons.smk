@@ -10,7 +10,7 @@ rule textons:
         at("benchmarks/textons/{sample}.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(3000),
         memory=MEMORY,
