@@ -7,7 +7,7 @@ from btfpipe.hashing import uniform
 from btfpipe.rendering.kernels import face_edges, film_ray, filter_offset
 
 ANISOTROPY = 16  # probes at most; a longer footprint is widened
-_LEAST = 0.1  # variance of a pixel, in texels squared, up to which it is a point (0.63 texels); whole from twice that on
+LEAST_VARIANCE = 0.1  # variance of a pixel, in texels squared, up to which it is a point (0.63 texels); whole from twice that on
 _SPLIT = 0.12  # variance that rays stand for, both axes, from which on strata are divided
 _TEXTURE_RATE = 3.3  # texture rays along an axis of the film for a texel a pixel
 MOST_TEXTURE_RAYS = 3  # of a ray along an axis
@@ -59,6 +59,18 @@ def film_steps(
             out[h, 0] = x - along * dx
             out[h, 1] = y - along * dy
             out[h, 2] = z - along * dz
+
+
+@njit(cache=True, nogil=True)
+def widest_square(mine, over_x, over_y):
+    """The largest sum of a point's two squared steps; no footprint is wider, whatever its direction."""
+    widest = 0.0
+    for h in mine:
+        square = 0.0
+        for k in range(3):
+            square += over_x[h, k] ** 2 + over_y[h, k] ** 2
+        widest = max(widest, square)
+    return widest
 
 
 @njit(cache=True, nogil=True)
@@ -263,7 +275,7 @@ def fill_footprints(
         _covariance(rx, ry, cx, cy, film[0], film[0], want)
         middle = (want[0] + want[2]) / 2
         apart = np.sqrt((want[0] - want[2]) ** 2 / 4 + want[1] * want[1])
-        whole = min(max((middle + apart) / _LEAST - 1, 0.0), 1.0)
+        whole = min(max((middle + apart) / LEAST_VARIANCE - 1, 0.0), 1.0)
         spread[q] = whole
         most = 1
         if whole > 0.0:

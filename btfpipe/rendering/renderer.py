@@ -7,10 +7,12 @@ from btfpipe.rendering import kernels
 from btfpipe.rendering.camera import filter_table, strata
 from btfpipe.rendering.footprint import Footprints, filter_variance, strata_parts
 from btfpipe.rendering.footprint_kernels import (
+    LEAST_VARIANCE,
     count_texture_rays,
     film_offsets,
     film_steps,
     texture_rays,
+    widest_square,
 )
 
 LAYERS = ("R", "G", "B", "A", "Z", "N.X", "N.Y", "N.Z", "texel.row", "texel.col")
@@ -257,6 +259,15 @@ class Renderer:
         )  # fmt: skip
         return over
 
+    def _film_offsets(self, points):
+        """Offset (n, 2) of points' rays in their pixels, and its strata; see `footprint_kernels.film_offsets`."""
+        n = len(points.hits)
+        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
+        film_offsets(
+            points.pixels, *strata(self.scene.film.samples), self.table, self.seed, offset, stratum
+        )
+        return offset, stratum
+
     def _texture_points(self, points, prim, directions):
         """The `Points` at which mapped objects are looked up, by the identity of the object, where they are others than its own.
 
@@ -273,8 +284,7 @@ class Renderer:
         film, camera = self.scene.film, self.scene.camera
         rows, cols = strata(film.samples)
         over = self._steps(points, prim, directions)
-        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
-        film_offsets(points.pixels, rows, cols, self.table, self.seed, offset, stratum)
+        offset, _ = self._film_offsets(points)
         for number in mapped:
             thing = self.scene.objects[number]
             mine = np.flatnonzero(points.thing == number)
@@ -326,23 +336,25 @@ class Renderer:
         if not filtered or not len(points.hits):
             return found
         n = len(points.hits)
-        over = self._steps(points, prim, directions)
-        rows, cols = strata(self.scene.film.samples)
-        offset, stratum = np.empty((n, 2)), np.empty((n, 2), np.int64)
-        film_offsets(points.pixels, rows, cols, self.table, self.seed, offset, stratum)
+        over, on_film = self._steps(points, prim, directions), None
+        variance = filter_variance(self.table)
         for number in filtered:
             thing = self.scene.objects[number]
             mine = np.flatnonzero(points.thing == number)
             fine = points.fine.get(id(thing))
             steps = over if fine is None else self._of_parents(fine, n)
+            widest = widest_square(mine, *steps) * thing.dressing.texels_per_unit**2
+            if widest * variance <= LEAST_VARIANCE:
+                continue  # all are points: nothing is spent on them
+            if on_film is None:
+                on_film = self._film_offsets(points)
             row, col, at_x, _, _, target, corner = self._look_up(thing, mine, points, steps[0])
             at_y = self._look_up(thing, mine, points, steps[1])[2]
             if fine is not None:
                 corner[:] = np.maximum(corner, 0)  # texture rays are where they should be
             made = Footprints(
                 thing.dressing.pyramid, row, col, target, corner, at_x, at_y,
-                thing.dressing.texels_per_unit, offset, stratum, self.parts,
-                filter_variance(self.table),
+                thing.dressing.texels_per_unit, *on_film, self.parts, variance,
             )  # fmt: skip
             if not made.points:
                 found[number] = made
