@@ -13,7 +13,7 @@ rule render:
         at("benchmarks/render/{look}.{scene}.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(4000),
         memory=MEMORY,
