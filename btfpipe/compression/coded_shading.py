@@ -10,6 +10,7 @@ from btfpipe.compression.root_blending import (
     RootWeights,
     ValueWeights,
     area_factors,
+    blend_pairs,
     texel_gain,
 )
 from btfpipe.parallel import blocks
@@ -230,9 +231,9 @@ def _add_means(
         q = owner[p]
         if q != at:
             at = q
-            _blend_pairs(first, pair[q], share[q], blended[0])
-            _blend_pairs(second, pair[q], share[q], blended[1])
-            _blend_pairs(third, pair[q], share[q], blended[2])
+            blend_pairs(first, pair[q], share[q], blended[0])
+            blend_pairs(second, pair[q], share[q], blended[1])
+            blend_pairs(third, pair[q], share[q], blended[2])
         corners(float(row[p]), float(col[p]), rows, cols, toroidal, texel, bilinear)
         _blend(
             texture[texel[0]], texture[texel[1]], texture[texel[2]], texture[texel[3]], bilinear, local
@@ -244,19 +245,6 @@ def _add_means(
         for c in range(3):
             root = colour[c, 0] * x + colour[c, 1] * y + colour[c, 2] * z
             out[q, c] += weight[p] * root * abs(root)
-
-
-@leaf(fastmath=_FAST)
-def _blend_pairs(angular, pair, weight, out):
-    """Fill ``out``, as far as there are terms, with the blended factors of some pairs."""
-    n = angular.shape[1]
-    for k in range(n):
-        out[k] = np.float32(0)
-    for p in range(len(pair)):
-        row = angular[pair[p]]
-        w = weight[p]
-        for k in range(n):
-            out[k] += w * row[k]
 
 
 @leaf(fastmath=_FAST)

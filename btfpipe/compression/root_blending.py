@@ -26,9 +26,8 @@ from btfpipe.parallel import blocks, single_threaded_blas
 from btfpipe.sample.shading import PairWeights, corners
 
 _QUERIES = 8192  # whose pairs are listed at a time
-_GAUSS = np.float32(
-    0.5 - 12**-0.5
-)  # of a texel from its middle: the Gauss points of its four quarters' cells
+# of a texel from its middle: the Gauss points of the four cells between texels that its area reaches into
+_GAUSS = np.float32(0.5 - 12**-0.5)
 _AREAS = 1024  # texels whose factors are blended at a time
 _LARGEST = 1 << 23  # scalar products kept, 64 MB
 _MOST = 16.0  # of a factor: as many directions as are ever blended, of which only one is lit
@@ -392,18 +391,24 @@ def _combine(lights, index, each, pair, weight):
 
 
 @leaf(fastmath={"contract", "reassoc", "nsz"})
-def _mean_square(rows, importance, pair, weight, blended):
-    """Sum over the texels of the squares of one colour's blended roots."""
-    n = rows.shape[1]
+def blend_pairs(angular, pair, weight, out):
+    """Fill `out`, as far as there are terms of this colour, with the blended factors of some pairs."""
+    n = angular.shape[1]
     for k in range(n):
-        blended[k] = np.float32(0)
+        out[k] = np.float32(0)
     for p in range(len(pair)):
-        row = rows[pair[p]]
+        row = angular[pair[p]]
         w = weight[p]
         for k in range(n):
-            blended[k] += w * row[k]
+            out[k] += w * row[k]
+
+
+@leaf(fastmath={"contract", "reassoc", "nsz"})
+def _mean_square(rows, importance, pair, weight, blended):
+    """Sum over the texels of the squares of one colour's blended roots."""
+    blend_pairs(rows, pair, weight, blended)
     total = np.float32(0)
-    for k in range(n):
+    for k in range(rows.shape[1]):
         total += importance[k] * blended[k] * blended[k]
     return total
 
