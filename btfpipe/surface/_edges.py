@@ -20,6 +20,8 @@ from btfpipe.compiled import njit
 _FLAT = 0.7  # cosine of the angle between faces; a flip must not bend faces more that meet at a sharper edge
 _FOLD = 0.2  # cosine of the turn of a normal in a collapse that makes a fold
 _STRETCH = 1.1  # by how much the square of a long edge may grow in a collapse
+_NARROW = 0.4  # of the longest edge: where lines run closer to each other, edges along them are let be longer,
+_WIDE = 1.5  # in square by this: those across are short, and vertices are better spent elsewhere
 _RING = 96  # vertices of more neighbours than this are left alone
 
 
@@ -121,6 +123,19 @@ def _area2(points, corner, h):
     return x * x + y * y + z * z
 
 
+@njit(cache=True, nogil=True)
+def _is_crowded(corner, opposite, feature, kind, points, h, longest2):
+    """Whether the edge at h runs along a line that another runs beside, closer than `_NARROW` of the longest edge."""
+    if feature[h] == 0:
+        return False
+    most = _NARROW * _NARROW * longest2 * _length2(points, corner[h], corner[next_of(h)])
+    for i in range(2):
+        g = h if i == 0 else opposite[h]
+        if g >= 0 and kind[corner[previous_of(g)]] and _area2(points, corner, g) < most:
+            return True
+    return False
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _halve(corner, opposite, feature, origin, h, m, n_faces):
     """Cut the face (a, b, c) at h into (a, m, c) in place and (m, b, c) behind the last; returns the latter's first half-edge."""
@@ -197,6 +212,12 @@ def split_long(
             a, b = corner[h], corner[next_of(h)]
             length = _length2(points, a, b)
             if length <= limit:
+                continue
+            if (
+                thin == 0.0
+                and length <= _WIDE * limit
+                and _is_crowded(corner, opposite, feature, kind, points, h, limit)
+            ):
                 continue
             free = thin > 0.0 and feature[h] > 0
             if not free and length < _longest_beside(corner, opposite, points, h):
@@ -361,12 +382,17 @@ def collapse_short(
     for start in range(3 * n_faces):
         if corner[start - start % 3] < 0 or opposite[start] > start:
             continue
-        if _length2(points, corner[start], corner[next_of(start)]) >= limit:
+        length, wide = _length2(points, corner[start], corner[next_of(start)]), 1.0
+        if length < _WIDE * limit and _is_crowded(
+            corner, opposite, feature, kind, points, start, bound
+        ):
+            wide = _WIDE
+        if length >= wide * limit:
             continue
         for side in range(2):
             h = start if side == 0 else opposite[start]
             if h >= 0 and _collapse(
-                corner, opposite, feature, leave, kind, points, flat, h, bound, _FOLD,
+                corner, opposite, feature, leave, kind, points, flat, h, wide * bound, _FOLD,
                 out_a, out_b, near_a, near_b,
             ):  # fmt: skip
                 done += 1

@@ -30,6 +30,7 @@ _MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
 _MOST_TRIED = 1_000_000
 _MOST_FITTED = 0.5  # spacings that a vertex moves to agree with the normals
 _FIELD_ROUNDS = 10
+_MOST_RELAXED = 20_000  # vertices; factorising takes a second there and a minute for three times as many
 _FEWEST = 20  # vertices of the coarsest level
 # measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
 _PROCESS_BYTES = 200 << 20
@@ -103,10 +104,10 @@ def prepare(
     for i in range(n_levels):
         wanted = max(n_vertices // 4**i, 4)
         with naming(name):
-            made = resample(
+            level, made = _level(
                 source, wanted, lambda done, total, i=i: report(i + done / total, n_levels + 1)
             )
-        fine, place, weights = made
+        levels.append(level)
         off = made.deviation
         if i == 0:
             problem = _problem(source, made, wanted)
@@ -114,25 +115,18 @@ def prepare(
                 raise InputError(_refusal(name, source, wanted, problem, _most_vertices(memory)))
             deviation = off
         level_distances.append(float(off.distances.max() / made.spacing))
-        normals = source.normals(place, weights)
-        levels.append(
-            Level(
-                _positions(source, made, normals), fine,
-                normals.astype(np.float32), np.zeros_like(normals, np.float32),
-            )
-        )  # fmt: skip
         if i == 0 and smooth:
-            moved = np.linalg.norm(levels[0].vertices - source.flat(place, weights), axis=1)
-            deviation = measure(levels[0].vertices, fine, vertices, faces, made.spacing)
-    fallbacks = []
-    for level, coarser in itertools.pairwise(levels):
-        level.parent_face, level.parent_weights, missed = parents(
-            level.vertices, level.normals, coarser.vertices, coarser.faces
-        )
-        fallbacks.append(missed)
+            flat = source.flat(made.place_face, made.place_weights)
+            moved = np.linalg.norm(level.vertices - flat, axis=1)
+            deviation = measure(level.vertices, level.faces, vertices, faces, made.spacing)
     report(n_levels, n_levels + 1)
     with naming(name):
+        for wanted in _field_vertices(n_vertices, n_levels):
+            levels.append(_level(source, wanted)[0])
+        fallbacks = _set_parents(levels)[: n_levels - 1]
         _lay_field(levels, strokes, turn)
+    levels = levels[:n_levels]
+    levels[-1].parent_face = levels[-1].parent_weights = None
     finest = levels[0]
     index = field.singularities(finest.faces, finest.normals, finest.tangents)
     lengths = edge_lengths(finest.vertices, finest.faces)
@@ -174,6 +168,37 @@ def _check_levels(name, n_vertices, n_levels):
             f"{name}: {n_levels} levels of {n_vertices} vertices leave {n_vertices // 4 ** (n_levels - 1)} on the coarsest;"
             f" expected at least {_FEWEST}. Ask for at most {fitting} with --levels, or for more vertices."
         )
+
+
+def _field_vertices(n_vertices, n_levels):
+    """Numbers of vertices of the levels beyond the last, which only the field is laid on: the last may be dense."""
+    n, found = n_vertices // 4 ** (n_levels - 1), []
+    while n > _MOST_RELAXED:
+        n //= 4
+        found.append(n)
+    return found
+
+
+def _level(source, wanted, report=lambda done, total: None):
+    """A level of about `wanted` vertices without tangents, and the Resampling that it shows."""
+    made = resample(source, wanted, report)
+    normals = source.normals(made.place_face, made.place_weights)
+    level = Level(
+        _positions(source, made, normals), made.faces,
+        normals.astype(np.float32), np.zeros_like(normals, np.float32),
+    )  # fmt: skip
+    return level, made
+
+
+def _set_parents(levels):
+    """Set each level's places on the next; returns how many vertices of each took the closest point."""
+    missed = []
+    for level, coarser in itertools.pairwise(levels):
+        level.parent_face, level.parent_weights, closest = parents(
+            level.vertices, level.normals, coarser.vertices, coarser.faces
+        )
+        missed.append(closest)
+    return missed
 
 
 def _positions(source, made, normals):

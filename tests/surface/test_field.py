@@ -3,6 +3,7 @@ import pytest
 
 from btfpipe.errors import InputError
 from btfpipe.surface import field
+from btfpipe.surface import prepare as preparing
 from btfpipe.surface.prepare import prepare
 from btfpipe.surface.topology import edges
 
@@ -39,6 +40,29 @@ def test_a_sphere_without_strokes_is_combed_around_the_y_axis(shapes):
     expected = np.cross(field.UP, finest.normals)
     away = np.linalg.norm(expected, axis=1) > 0.5
     assert np.degrees(angle_between(finest.tangents, expected)[away].max()) < 6
+
+
+def test_the_field_of_a_dense_last_level_comes_from_coarser_ones(shapes, monkeypatch):
+    """To factorise the matrix of 60,000 vertices takes a minute, and of 250,000 many."""
+    factorised, real = [], field.relaxed_field
+
+    def relaxed(vertices, faces, normals):
+        factorised.append(len(vertices))
+        return real(vertices, faces, normals)
+
+    monkeypatch.setattr(field, "relaxed_field", relaxed)
+    direct, facts = prepare(*shapes.double_ring(), 4000, 1)
+    monkeypatch.setattr(preparing, "_MOST_RELAXED", 1000)
+    surface, facts_of_both = prepare(*shapes.double_ring(), 4000, 1)
+    assert factorised == [facts["vertices"], pytest.approx(1000, rel=0.1)]
+    assert len(surface.levels) == 1
+    assert surface.levels[0].parent_face is None
+    assert facts_of_both.keys() == facts.keys()
+    assert facts_of_both["closest_point_parents"] == []
+    assert facts_of_both["index_sum"] == facts["euler_characteristic"]
+    assert facts_of_both["singularities"] == facts["singularities"]
+    off = np.degrees(angle_between(surface.levels[0].tangents, direct.levels[0].tangents))
+    assert np.median(off) < 10
 
 
 def test_frames_are_orthonormal_and_right_handed(shapes):

@@ -18,8 +18,8 @@ from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 QUICK = {"plank", "comb", "starfish", "hedgehog", "capsule"}
 SMOOTH = {"cylinder", "starfish", "capsule"}
-# lines closer to each other than half a spacing force edges as short
-CROWDED = {("plank", 3000): 0.22, ("hedgehog", 3000): 0.22}
+# spikes of half a spacing, and bars of 1.3 spacings, which neither one row of triangles nor two fill evenly
+CROWDED = {("hedgehog", 3000): 0.215, ("cage", 3000): 0.225}
 
 
 def triangle_grid(parts):
@@ -82,7 +82,7 @@ def check(name, mesh, n, evenness):
     "name",
     [
         name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
-        for name in sorted(SHAPES.keys() - {"cage"})
+        for name in sorted(SHAPES)
     ],
 )
 def test_shapes_are_kept_at_three_thousand_vertices(name):
