@@ -27,10 +27,10 @@ from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 _TOLERANCE = 0.05
 _MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
-_MOST_TRIED = 1_000_000
+_MOST_TRIED = 100_000  # vertices, or twice those asked for
 _MOST_FITTED = 0.5  # spacings that a vertex moves to agree with the normals
 _FIELD_ROUNDS = 10
-_MOST_RELAXED = 20_000  # vertices; factorising takes a second there and a minute for three times as many
+_MOST_RELAXED = 20_000  # vertices; factorising takes a second, and a minute for three times as many
 _FEWEST = 20  # vertices of the coarsest level
 # measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
 _PROCESS_BYTES = 200 << 20
@@ -112,7 +112,11 @@ def prepare(
         if i == 0:
             problem = _problem(source, made, wanted)
             if problem:
-                raise InputError(_refusal(name, source, wanted, problem, _most_vertices(memory)))
+                said = _refusal(
+                    name, source, wanted, problem, _most_vertices(wanted, memory),
+                    lambda share: report(1 + n_levels * share, n_levels + 1),
+                )  # fmt: skip
+                raise InputError(said)
             deviation = off
         level_distances.append(float(off.distances.max() / made.spacing))
         if i == 0 and smooth:
@@ -222,11 +226,12 @@ def _positions(source, made, normals):
     return flat + move * np.minimum(1, moves.max() / np.maximum(length, 1e-300))
 
 
-def _most_vertices(memory):
+def _most_vertices(wanted, memory):
     """How many vertices are tried when those asked for do not suffice."""
+    most = max(_MOST_TRIED, 2 * wanted)
     if memory is None:
-        return _MOST_TRIED
-    return min(_MOST_TRIED, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
+        return most
+    return min(most, (memory - _PROCESS_BYTES) // _BYTES_A_VERTEX)
 
 
 def _check_memory(name, n_vertices, memory):
@@ -264,19 +269,24 @@ def _problem(source, made, wanted):
     return None
 
 
-def _refusal(name, source, wanted, problem, most):
-    """The sentence that says what is wrong and how many vertices do, of at most `most`: that many are tried."""
+def _refusal(name, source, wanted, problem, most, report):
+    """The sentence that says what is wrong and how many vertices do, of at most `most`.
+
+    That many are tried. Steps grow, so that a shape that none suffice for is known after a few of them.
+    """
     said, excess = problem
     start = f"{name}: {wanted} vertices asked for are too few for its shape: {said}."
-    n = wanted
+    n, least = wanted, 1.0
     while n < most:
-        n = min(math.ceil(n * min(max(excess, _MORE_VERTICES), _MOST_MORE) / 100) * 100, most)
+        least = min(least * _MORE_VERTICES, _MOST_MORE)
+        n = min(math.ceil(n * min(max(excess, least), _MOST_MORE) / 100) * 100, most)
+        report(n / most)
         problem = _problem(source, resample(source, n), n)
         if not problem:
             return f"{start} Ask for {n} with --vertices."
         excess = problem[1]
     return (
-        f"{start} Up to {n} were tried, and do not suffice. Leave out what is too fine to show, for example"
+        f"{start} Up to {n} were tried, and do not suffice. Ask for more, or leave out what is too fine to show, for example"
         " with MeshLab's filter `Simplification: Quadric Edge Collapse Decimation`."
     )
 

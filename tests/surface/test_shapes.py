@@ -154,8 +154,14 @@ def test_a_torn_result_is_not_written(monkeypatch, lost):
     monkeypatch.setattr(preparation, "resample", torn)
     monkeypatch.setattr(preparation, "_MOST_TRIED", 4000)
     said = "0.60 spacings from it" if lost == "limb" else r"area would change by 4\.\d %"
-    with pytest.raises(InputError, match=said):
-        prepare(*SHAPES["cylinder"](), 3000, 1, smooth=False)
+    shares = []
+    with pytest.raises(InputError, match=f"{said}.* Up to 6000 were tried, and do not suffice"):
+        prepare(
+            *SHAPES["cylinder"](), 3000, 1, smooth=False,
+            report=lambda done, total: shares.append(done / total),
+        )  # fmt: skip
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
 
 
 def test_coarser_levels_say_how_far_off_they_are():
