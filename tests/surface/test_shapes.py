@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from shared_shapes import SHAPES
+from shared_shapes import CROWDED, SHAPES
 
 from btfpipe.errors import InputError
 from btfpipe.surface import deviation
@@ -18,8 +18,6 @@ from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 QUICK = {"plank", "comb", "starfish", "hedgehog", "capsule"}
 SMOOTH = {"cylinder", "starfish", "capsule"}
-# spikes of half a spacing, and bars of 1.3 spacings, which neither one row of triangles nor two fill evenly
-CROWDED = {("hedgehog", 3000): 0.215, ("cage", 3000): 0.225}
 
 
 def triangle_grid(parts):
