@@ -243,6 +243,8 @@ def representative_pictures(textures, angular, toroidal, count, seed=0, threads=
     """
     if count >= len(angular):
         return np.arange(len(angular))
+    # counted before any arithmetic: products of equal rows may differ by their rounding
+    count = min(count, len(np.unique(angular.reshape(len(angular), -1), axis=0)))
     rows, cols, n = textures.shape
     step = max(1, min(rows, cols) // _GRID)
     pictures = np.ascontiguousarray(textures.transpose(2, 0, 1))
