@@ -9,7 +9,7 @@ import numpy as np
 from btfpipe.errors import InputError, naming, too_little
 from btfpipe.surface import field
 from btfpipe.surface.cleaning import clean
-from btfpipe.surface.consistency import consistent_positions
+from btfpipe.surface.consistency import consistent_positions, fair_normals
 from btfpipe.surface.curl import curl_facts
 from btfpipe.surface.deviation import (
     MOST_SPACINGS,
@@ -28,7 +28,6 @@ from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 _TOLERANCE = 0.05
 _MORE_VERTICES, _MOST_MORE = 1.25, 3.0  # growth from one trial to the next
 _MOST_TRIED = 100_000  # vertices, or twice those asked for
-_MOST_FITTED = 0.5  # spacings that a vertex moves to agree with the normals
 _FIELD_ROUNDS = 10
 _MOST_RELAXED = 20_000  # vertices; factorising takes a second, and a minute for three times as many
 _FEWEST = 20  # vertices of the coarsest level
@@ -186,9 +185,9 @@ def _field_vertices(n_vertices, n_levels):
 def _level(source, wanted, report=lambda done, total: None):
     """A level of about `wanted` vertices without tangents, and the Resampling that it shows."""
     made = resample(source, wanted, report)
-    normals = source.normals(made.place_face, made.place_weights)
+    normals, positions = _smoothed(source, made)
     level = Level(
-        _positions(source, made, normals), made.faces,
+        positions, made.faces,
         normals.astype(np.float32), np.zeros_like(normals, np.float32),
     )  # fmt: skip
     return level, made
@@ -205,25 +204,30 @@ def _set_parents(levels):
     return missed
 
 
-def _positions(source, made, normals):
-    """Vertices on the smooth surface, moved so that triangles agree with their normals where facets were wide.
+def _smoothed(source, made):
+    """Normals and positions of the vertices as if the input had no facets; without smoothing as they are.
 
-    Each moves by `_MOST_FITTED` of a spacing at most, by twice what the smoothing moves the faces of the input around
-    it, and no farther from the input than the smoothing moves at most.
+    Positions lie on the Phong tessellation, moved so that triangles agree with their normals. None lies farther from
+    the input than the Phong tessellation of its paper does at most: what would go beyond is eased.
     """
     faces, place, weights = made
+    normals = source.normals(place, weights)
     lifted = source.lift(place, weights)
     if source.alpha == 0:
-        return lifted
-    moves = source.largest_moves()
-    around = np.zeros(len(source.vertices))
-    np.maximum.at(around, source.faces, moves[:, None])
-    near = np.einsum("kc,kc->k", weights, around[source.faces[place]])
-    most = np.minimum(_MOST_FITTED * made.spacing, 2 * near)
-    flat = source.flat(place, weights)
-    move = consistent_positions(lifted, faces, normals, most) - flat
-    length = np.linalg.norm(move, axis=1, keepdims=True)
-    return flat + move * np.minimum(1, moves.max() / np.maximum(length, 1e-300))
+        return normals, lifted
+    width = source.widths(place, weights) / made.spacing
+    normals = fair_normals(faces, normals, width)
+    move = consistent_positions(lifted, faces, normals, width) - lifted
+    length = np.linalg.norm(move, axis=1)
+    left = source.largest_move() - np.linalg.norm(lifted - source.flat(place, weights), axis=1)
+    share = source.agreeing(place, weights) * _eased(length, left) / np.maximum(length, 1e-300)
+    return normals, lifted + share[:, None] * move
+
+
+def _eased(length, most):
+    """Lengths up to half of `most` as they are, longer ones smoothly shortened to below `most`."""
+    beyond = 2 * length / np.maximum(most, 1e-300) - 1
+    return np.where(beyond > 0, most * (1 + np.tanh(beyond)) / 2, length)
 
 
 def _most_vertices(wanted, memory):

@@ -6,9 +6,12 @@ import numpy as np
 
 from btfpipe.surface.topology import edge_normals_angle, half_edges, opposite_half_edges
 
-PHONG_ALPHA = 0.75
+# Corners with the normals of a quadric give this quadric, and no other strength does. The paper takes 3/4 by looks.
+PHONG_ALPHA, _PAPER_ALPHA = 0.5, 0.75
 # angles between faces up to which their vertices are rounded off in full, and from which on not at all
 _ROUND_DEG, _FLAT_DEG = 45, 75
+# likewise for moves that make triangles agree with normals
+_AGREE_DEG, _CORNER_DEG = 75, 90
 
 
 @dataclass
@@ -26,9 +29,9 @@ class SmoothInput:
         See `topology.opposite_half_edges`.
     crease : (3 m,) bool
         Half-edges across which normals are not averaged.
-    ease : (n,) float64
-        1 where the smooth surface may leave the faces, 0 at vertices of creases and of sharp edges, which are
-        corners rather than coarse pieces of something round.
+    sharpest : (n,) float64
+        Largest angle between faces that meet at an edge of each vertex, degrees; 180 at creases. Sharp ones are
+        corners rather than coarse pieces of something round, where the smooth surface stays on the faces.
     alpha : float
         Strength of the Phong tessellation, 0 for the flat faces.
     """
@@ -38,7 +41,7 @@ class SmoothInput:
     corner_normals: np.ndarray
     opposite: np.ndarray
     crease: np.ndarray
-    ease: np.ndarray
+    sharpest: np.ndarray
     alpha: float
 
     def flat(self, face, weights):
@@ -57,18 +60,38 @@ class SmoothInput:
         corners = self.vertices[self.faces[face]]
         normals = self.corner_normals[face]
         above = np.einsum("kcx,kcx->kc", flat[:, None] - corners, normals)
-        eased = weights * self.ease[self.faces[face]]
+        eased = weights * _falling(self.sharpest, _ROUND_DEG, _FLAT_DEG)[self.faces[face]]
         return flat - self.alpha * np.einsum("kc,kc,kcx->kx", eased, above, normals)
 
-    def largest_moves(self):
-        """How far `lift` moves points of each face, (m,) float64: the most of its middle and those of its edges."""
+    def largest_move(self):
+        """How far the Phong tessellation of the paper's strength takes points off their faces at most, a float.
+
+        Read at the middles of faces and of their edges.
+        """
         face = np.arange(len(self.faces))
-        most = np.zeros(len(face))
+        most = 0.0
         for weights in ((1, 1, 1), (1, 1, 0), (0, 1, 1), (1, 0, 1)):
             w = np.tile(np.array(weights) / sum(weights), (len(face), 1))
             move = self.lift(face, w) - self.flat(face, w)
-            most = np.maximum(most, np.linalg.norm(move, axis=1))
-        return most
+            most = max(most, np.linalg.norm(move, axis=1).max())
+        return most * _PAPER_ALPHA / self.alpha
+
+    def agreeing(self, face, weights):
+        """Share of the move that makes triangles agree with normals, (k,) float64: normals of corners mean no shape."""
+        share = _falling(self.sharpest, _AGREE_DEG, _CORNER_DEG)
+        return np.einsum("kc,kc->k", weights, share[self.faces[face]])
+
+    def widths(self, face, weights):
+        """Widths of the faces around points, (k,) float64: heights over their longest edges, evened over neighbours."""
+        corners = self.vertices[self.faces]
+        edges = np.roll(corners, -1, axis=1) - corners
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        longest = np.sqrt((edges**2).sum(axis=2).max(axis=1))
+        width = np.repeat(area / np.maximum(longest, 1e-300), 3)
+        corner = self.faces.ravel()
+        count = np.maximum(np.bincount(corner, minlength=len(self.vertices)), 1)
+        around = np.bincount(corner, width, len(self.vertices)) / count
+        return np.einsum("kc,kc->k", weights, around[self.faces[face]])
 
     def normals(self, face, weights):
         """Unit shading normals, (k, 3) float64, interpolated from the corners."""
@@ -76,6 +99,11 @@ class SmoothInput:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         flat = self.corner_normals[face, 0]
         return np.where(length > 1e-6, normals / np.maximum(length, 1e-6), flat)
+
+
+def _falling(angle, full, none):
+    """1 up to `full` degrees, 0 from `none` on, and even between."""
+    return np.clip((none - angle) / (none - full), 0, 1)
 
 
 def barycentric(points, corners):
@@ -138,9 +166,8 @@ def smooth_input(vertices, faces, crease_deg=None, alpha=PHONG_ALPHA):
     sharpest = np.zeros(len(vertices))
     start, end = half_edges(faces)
     np.maximum.at(sharpest, np.r_[start, end], np.r_[angle, angle])
-    ease = np.clip((_FLAT_DEG - sharpest) / (_FLAT_DEG - _ROUND_DEG), 0, 1)
-    ease[start[crease]] = ease[end[crease]] = 0
-    return SmoothInput(vertices, faces, normals, opposite, crease, ease, alpha)
+    sharpest[start[crease]] = sharpest[end[crease]] = 180
+    return SmoothInput(vertices, faces, normals, opposite, crease, sharpest, alpha)
 
 
 def _corner_normals(vertices, faces, opposite, crease):
