@@ -124,7 +124,8 @@ def cage():
     return boxes(rows)
 
 
-def _icosphere(halvings):
+def icosphere(halvings):
+    """A unit sphere of 20 * 4**halvings triangles."""
     from scipy.spatial import ConvexHull
 
     ratio = (1 + 5**0.5) / 2
@@ -153,7 +154,7 @@ def _outward(points, faces):
 @_shape
 def starfish():
     """Five long arms that thin out to blunt tips."""
-    points, faces = _icosphere(5)
+    points, faces = icosphere(5)
     radius = np.full(len(points), 0.12)
     for k in range(5):
         arm = np.array([np.cos(0.4 * np.pi * k), np.sin(0.4 * np.pi * k), 0])

@@ -115,8 +115,8 @@ def _lattice(side=61):
 @pytest.mark.parametrize("across", [False, True])
 def test_fair_normals_keep_waves_of_two_facets_and_lose_those_of_one(waves, kept, across):
     """The filter's law, 1 / (1 + 0.2 (k w / pi)^4), for waves along and across the edges."""
-    width = 6.0
-    places, faces, inside = _lattice()
+    width = 12.0
+    places, faces, inside = _lattice(121)
     k = 2 * np.pi / (waves * width)
     tilt = 0.02 * np.sin(k * places[:, int(across)])
     normals = np.stack([tilt, 0 * tilt, np.ones_like(tilt)], axis=1)
@@ -140,9 +140,7 @@ def test_fair_normals_are_those_of_a_dense_solution():
         for i, j in ((a, b), (b, a)):
             umbrella[i, i] += 1 / 1.5
             umbrella[i, j] -= 1 / 1.5
-    apart = [
-        (normals[i] * normals[j]).sum() <= 0.8 for i, j in edges(level.faces)
-    ]
+    apart = [(normals[i] * normals[j]).sum() <= 0.8 for i, j in edges(level.faces)]
     for i, j in edges(level.faces)[apart]:
         umbrella[i] = umbrella[j] = 0
     assert 0 < sum(apart) < 40

@@ -7,13 +7,14 @@ import json
 
 import numpy as np
 import pytest
-from shared_shapes import CROWDED, SHAPES
+from shared_shapes import CROWDED, SHAPES, icosphere
 
 from btfpipe.errors import InputError
 from btfpipe.surface import deviation
 from btfpipe.surface import prepare as preparation
 from btfpipe.surface.cleaning import clean
 from btfpipe.surface.prepare import prepare
+from btfpipe.surface.smooth_input import smooth_input
 from btfpipe.surface.topology import describe, edge_lengths, mesh_area
 
 QUICK = {"plank", "comb", "starfish", "hedgehog", "capsule"}
@@ -181,6 +182,37 @@ def test_boxes_stay_boxes_though_smoothed():
         facts["distance"]["result_to_input"]["max"]
         <= facts["smoothing_moved"]["max"] + 0.5 * facts["spacing"]
     )
+
+
+def test_a_coarse_ball_is_smoothed_into_a_ball():
+    """Corners with a ball's normals give the ball, whose radius everybody knows."""
+    off = {}
+    for smooth in (False, True):
+        surface, _ = prepare(*icosphere(2), 10_000, 1, smooth=smooth)
+        off[smooth] = np.abs(np.linalg.norm(surface.levels[0].vertices, axis=1) - 1).mean()
+    assert off[True] < 0.1 * off[False]
+
+
+def test_smoothing_moves_nothing_farther_than_phong_tessellation_does():
+    """That of its paper: with 3/4 of the pull to the tangent planes."""
+    for name in ("starfish", "hedgehog"):
+        vertices, faces = SHAPES[name]()
+        _, facts = prepare(vertices, faces, 30_000, 1)
+        assert 0 < facts["smoothing_moved"]["max"] <= smooth_input(vertices, faces).largest_move()
+
+
+def test_a_box_beside_a_ball_stays_a_box():
+    """The ball's facets set how far vertices may move; normals of the box's corners would swell its sides by as much."""
+    ball, ball_faces = icosphere(1)
+    box, box_faces = SHAPES["beam"]()
+    both = np.concatenate([box, 4 * ball + (0, 8, 0)])
+    surface, _ = prepare(both, np.concatenate([box_faces, ball_faces + len(box)]), 6000, 1)
+    level = surface.levels[0]
+    low, high = box.min(axis=0), box.max(axis=0)
+    on_box = level.vertices[level.vertices[:, 1] < 3]
+    off = np.abs(np.stack([on_box - low, on_box - high])).min(axis=(0, 2))
+    assert len(on_box) > 2000
+    assert off.max() < 1e-6
 
 
 def sheets(gap):
