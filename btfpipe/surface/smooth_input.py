@@ -94,8 +94,24 @@ class SmoothInput:
         return np.einsum("kc,kc->k", weights, around[self.faces[face]])
 
     def normals(self, face, weights):
-        """Unit shading normals, (k, 3) float64, interpolated from the corners."""
-        normals = np.einsum("kc,kcx->kx", weights, self.corner_normals[face])
+        """Unit shading normals, (k, 3) float64, between those of the corners.
+
+        Linear interpolation irons waves out: the ends of an edge on a slope between a valley and a hill have normals
+        that look the same way, straight up. So the mean normal of two corners is turned until it is orthogonal to
+        their edge, and normals between are quadratic, for the same purpose as those of PN triangles (Vlachos, Peters,
+        Boyd and Mitchell 2001). Corners that `lift` leaves alone keep to linear ones.
+        """
+        corners = self.vertices[self.faces[face]]
+        own = self.corner_normals[face]
+        round_ = _falling(self.sharpest, _ROUND_DEG, _FLAT_DEG)[self.faces[face]]
+        normals = np.einsum("kc,kcx->kx", weights, own)
+        if self.alpha > 0:
+            for i, j in ((0, 1), (1, 2), (2, 0)):
+                along = corners[:, j] - corners[:, i]
+                mean = (own[:, i] + own[:, j]) / 2
+                square = np.maximum(_dot(along, along), 1e-300)
+                share = 4 * weights[:, i] * weights[:, j] * np.minimum(round_[:, i], round_[:, j])
+                normals = normals - (share * _dot(mean, along) / square)[:, None] * along
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         flat = self.corner_normals[face, 0]
         return np.where(length > 1e-6, normals / np.maximum(length, 1e-6), flat)

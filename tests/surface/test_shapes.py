@@ -193,6 +193,32 @@ def test_a_coarse_ball_is_smoothed_into_a_ball():
     assert off[True] < 0.1 * off[False]
 
 
+def test_normals_between_corners_are_nearer_to_those_of_waves_than_linear_ones():
+    """A sheet of waves, eight facets each, whose slopes everybody knows."""
+    k, height = np.pi / 4, 0.2
+    i, j = (a.ravel().astype(float) for a in np.meshgrid(range(41), range(41), indexing="ij"))
+    corner = np.arange(41 * 41).reshape(41, 41)
+    a, b, c, d = (
+        x.ravel() for x in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
+    )
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    vertices = np.stack([i, j, height * np.sin(k * i) * np.cos(k * j)], axis=1)
+    rng = np.random.default_rng(3)
+    face, weights = rng.integers(0, len(faces), 5000), rng.dirichlet((1, 1, 1), 5000)
+    off = {}
+    for alpha in (0.0, 0.5):
+        source = smooth_input(vertices, faces, alpha=alpha)
+        x, y, _ = source.flat(face, weights).T
+        true = (
+            height * k * np.stack([-np.cos(k * x) * np.cos(k * y), np.sin(k * x) * np.sin(k * y)])
+        )
+        true = np.append(true, np.ones((1, 5000)), axis=0)
+        cosine = (source.normals(face, weights) * true.T).sum(axis=1) / np.linalg.norm(true, axis=0)
+        inside = (np.abs(x - 20) < 14) & (np.abs(y - 20) < 14)
+        off[alpha] = np.arccos(np.clip(cosine, -1, 1))[inside].mean()
+    assert off[0.5] < 0.6 * off[0.0]
+
+
 def test_smoothing_moves_nothing_farther_than_phong_tessellation_does():
     """That of its paper: with 3/4 of the pull to the tangent planes."""
     for name in ("starfish", "hedgehog"):
