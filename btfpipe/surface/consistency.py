@@ -9,7 +9,7 @@ from btfpipe.surface.topology import half_edges, opposite_half_edges
 # Edges that leave the normals' tangent plane by more (a sine, 37 degrees) cross creases and corners: faces meet at 75.
 _STEEPEST = 0.6
 # Heights follow normals at least so many edges far.
-_NEAREST = 6.0
+_NEAREST = 1.0
 _MOST_ITERATIONS = 400
 _TOLERANCE = 1e-3
 _ONE_SIDE = 0.8  # cosine between normals of neighbours that no crease parts
@@ -68,7 +68,7 @@ def fair_normals(faces, normals, width):
     return fair / np.linalg.norm(fair, axis=1, keepdims=True)
 
 
-def consistent_positions(vertices, faces, normals, width=_NEAREST):
+def consistent_positions(vertices, faces, normals, width):
     """Move vertices along their shading normals so that the triangles agree with these.
 
     A coarse mesh that is resampled densely keeps its facets, while shading normals turn smoothly across them.

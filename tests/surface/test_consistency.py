@@ -9,7 +9,7 @@ from btfpipe.surface.topology import edges
 
 def consistent_heights(vertices, faces, normals):
     """How far vertices move along their normals; nothing moves across them."""
-    step = consistent_positions(vertices, faces, normals) - vertices
+    step = consistent_positions(vertices, faces, normals, 6) - vertices
     heights = (step * normals).sum(axis=1)
     np.testing.assert_allclose(step, heights[:, None] * normals, atol=1e-6)
     return heights
