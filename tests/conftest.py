@@ -138,3 +138,19 @@ def make_measurement(tmp_path):
         return path, codes
 
     return make
+
+
+def pytest_collection_modifyitems(items):
+    """Order files for processes side by side.
+
+    The longest ones, of the workflow, come first, so that no process waits for another at the end. Then files of far
+    folders take turns: two processes in one folder would compile the same kernels twice.
+    """
+    files = {}
+    for item in sorted(items, key=lambda item: item.path.parent.name != "workflow"):
+        files.setdefault(item.path, []).append(item)
+    files = list(files.values())
+    half = (len(files) + 1) // 2
+    order = [None] * len(files)
+    order[::2], order[1::2] = files[:half], files[half:]
+    items[:] = [item for file in order for item in file]

@@ -223,7 +223,7 @@ def test_smoothing_moves_nothing_farther_than_phong_tessellation_does():
     """That of its paper: with 3/4 of the pull to the tangent planes."""
     for name in ("starfish", "hedgehog"):
         vertices, faces = SHAPES[name]()
-        _, facts = prepare(vertices, faces, 30_000, 1)
+        _, facts = prepare(vertices, faces, 8000, 1)
         assert 0 < facts["smoothing_moved"]["max"] <= smooth_input(vertices, faces).largest_move()
 
 
