@@ -16,7 +16,7 @@ rule compare_model:
         at("benchmarks/compare_model/{sample}.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(2000),
         memory=MEMORY,
@@ -47,7 +47,7 @@ rule compare_truth:
         what="model|sample",
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(2000),
         memory=MEMORY,

@@ -15,7 +15,7 @@ rule simulate_truth:
         at("benchmarks/simulate/{sample}.jsonl")
     conda:
         "../envs/btfpipe.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=mem_mb(2000),
         memory=MEMORY,
