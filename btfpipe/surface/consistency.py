@@ -13,8 +13,8 @@ _NEAREST = 1.0
 _MOST_ITERATIONS = 400
 _TOLERANCE = 1e-3
 _ONE_SIDE = 0.8  # cosine between normals of neighbours that no crease parts
-_KEPT = 0.2  # share of what changes from facet to facet that is lost, against one part that is kept
-_EVEN_ENOUGH = 0.002  # of what is uneven at the start
+_LOST = 0.2  # of waves of two facets, against one part that is kept
+_EVEN_ENOUGH = 0.002  # residual, against that of the given normals
 
 
 def fair_normals(faces, normals, width):
@@ -54,7 +54,7 @@ def fair_normals(faces, normals, width):
     degree = np.diff(joined.indptr)
     # six neighbours at one edge's distance make 3/2 of the second derivatives' sum
     umbrella = (diags_array(degree.astype(float)) - joined) / 1.5
-    stiffness = diags_array(np.where(whole, _KEPT * (width / np.pi) ** 4, 0.0))
+    stiffness = diags_array(np.where(whole, _LOST * (width / np.pi) ** 4, 0.0))
     system = (eye_array(len(normals)) + umbrella.T @ stiffness @ umbrella).tocsr()
     diagonal = diags_array(1 / system.diagonal())
     fair = np.empty_like(normals)
@@ -74,15 +74,15 @@ def consistent_positions(vertices, faces, normals, width):
     A coarse mesh that is resampled densely keeps its facets, while shading normals turn smoothly across them.
     Where light grazes, such facets lie in their own or each other's shadow, though the surface that the normals
     describe does not; Phong tessellation makes them smooth only where the normals at their corners are those of one
-    quadric. No offset of single points mends that, as the facets are wider than a face. Positions and normals are brought together as in Nehab, Rusinkiewicz,
-    Davis and Ramamoorthi 2005 (Efficiently combining positions and normals for precise 3D geometry): the heights
-    h make edges orthogonal to the mean normal of their ends in the least squares sense,
+    quadric. No offset of single points mends that, as the facets are wider than a face. Positions and normals are
+    brought together as in Nehab, Rusinkiewicz, Davis and Ramamoorthi 2005 (Efficiently combining positions and normals
+    for precise 3D geometry): the heights h make edges orthogonal to the mean normal of their ends in the least
+    squares sense,
 
         sum over edges ((x_j - x_i) . (n_i + n_j) / 2 + h_j - h_i)^2 + sum over vertices (h_i / w_i)^2 -> min.
 
     Heights follow the normals as far as facets are wide, w edges, and not farther. Edges that cross creases are left
-    out. Triangles that agree with their normals to second order, on whatever
-    coarse mesh, stay where they are.
+    out. Triangles that agree with their normals to second order, on whatever coarse mesh, stay where they are.
 
     Parameters
     ----------

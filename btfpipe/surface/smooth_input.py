@@ -103,14 +103,14 @@ class SmoothInput:
         """
         corners = self.vertices[self.faces[face]]
         own = self.corner_normals[face]
-        round_ = _falling(self.sharpest, _ROUND_DEG, _FLAT_DEG)[self.faces[face]]
+        rounded = _falling(self.sharpest, _ROUND_DEG, _FLAT_DEG)[self.faces[face]]
         normals = np.einsum("kc,kcx->kx", weights, own)
         if self.alpha > 0:
             for i, j in ((0, 1), (1, 2), (2, 0)):
                 along = corners[:, j] - corners[:, i]
                 mean = (own[:, i] + own[:, j]) / 2
                 square = np.maximum(_dot(along, along), 1e-300)
-                share = 4 * weights[:, i] * weights[:, j] * np.minimum(round_[:, i], round_[:, j])
+                share = 4 * weights[:, i] * weights[:, j] * np.minimum(rounded[:, i], rounded[:, j])
                 normals = normals - (share * _dot(mean, along) / square)[:, None] * along
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         flat = self.corner_normals[face, 0]
