@@ -41,8 +41,8 @@ def fair_normals(faces, normals, width):
     (n, 3) float64
         Unit normals.
     """
-    from scipy.sparse import diags_array, eye_array
-    from scipy.sparse.linalg import cg
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import LinearOperator, cg
 
     joined = _neighbour_matrix(faces, len(normals))
     row = np.repeat(np.arange(len(normals)), np.diff(joined.indptr))
@@ -54,16 +54,21 @@ def fair_normals(faces, normals, width):
     degree = np.diff(joined.indptr)
     # six neighbours at one edge's distance make 3/2 of the second derivatives' sum
     umbrella = (diags_array(degree.astype(float)) - joined) / 1.5
-    stiffness = diags_array(np.where(whole, _LOST * (width / np.pi) ** 4, 0.0))
-    system = (eye_array(len(normals)) + umbrella.T @ stiffness @ umbrella).tocsr()
-    diagonal = diags_array(1 / system.diagonal())
+    stiffness = np.where(whole, _LOST * (width / np.pi) ** 4, 0.0)
+    diagonal = 1 + umbrella.multiply(umbrella) @ stiffness
+    size = (len(normals),) * 2
+    # not multiplied out, which takes four times the memory
+    system = LinearOperator(
+        size, lambda x: x + umbrella @ (stiffness * (umbrella @ x)), dtype=float
+    )
+    inverse = LinearOperator(size, lambda x: x / diagonal, dtype=float)
     fair = np.empty_like(normals)
     with single_threaded_blas():
         for c in range(3):
-            uneven = np.linalg.norm(system @ normals[:, c] - normals[:, c])
+            uneven = np.linalg.norm(system.matvec(normals[:, c]) - normals[:, c])
             fair[:, c], _ = cg(
                 system, normals[:, c], normals[:, c], rtol=1e-9, atol=_EVEN_ENOUGH * uneven,
-                maxiter=_MOST_ITERATIONS, M=diagonal,
+                maxiter=_MOST_ITERATIONS, M=inverse,
             )  # fmt: skip
     return fair / np.linalg.norm(fair, axis=1, keepdims=True)
 

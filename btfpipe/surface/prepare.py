@@ -31,9 +31,9 @@ _MOST_TRIED = 100_000  # vertices, or twice those asked for
 _FIELD_ROUNDS = 10
 _MOST_RELAXED = 20_000  # vertices; factorising takes a second, and a minute for three times as many
 _FEWEST = 20  # vertices of the coarsest level
-# measured as peaks of the whole process, 60,000 to 500,000 vertices, with some room
-_PROCESS_BYTES = 200 << 20
-_BYTES_A_VERTEX = 1500
+# measured as peaks of the whole process, 20,000 to 500,000 vertices, kernels to compile and some room included
+_PROCESS_BYTES = 300 << 20
+_BYTES_A_VERTEX = 2400
 
 
 def prepare(

@@ -15,11 +15,11 @@ def test_memory_that_does_not_suffice_is_refused_with_the_vertices_that_fit(
 ):
     mesh = shapes.obj(tmp_path / "sphere.obj", *shapes.sphere(1))
     ask = ("surface", mesh, "-o", tmp_path / "s.npz", "--levels", 1)
-    done = btfpipe(*ask, "--vertices", 20000, "--memory", "202M", code=3)
-    assert "sphere.obj: 20000 vertices need about 229 MB; --memory allows 202 MB" in done.stderr
+    done = btfpipe(*ask, "--vertices", 20000, "--memory", "302M", code=3)
+    assert "sphere.obj: 20000 vertices need about 346 MB; --memory allows 302 MB" in done.stderr
     fits = int(re.search(r"at most (\d+) with --vertices", done.stderr)[1])
-    btfpipe(*ask, "--vertices", fits + 1, "--memory", "202M", code=3)
-    btfpipe(*ask, "--vertices", fits, "--memory", "202M")
+    btfpipe(*ask, "--vertices", fits + 1, "--memory", "302M", code=3)
+    btfpipe(*ask, "--vertices", fits, "--memory", "302M")
     done = btfpipe(*ask, "--vertices", 100, "--memory", "100M", "--force", code=3)
     assert "Raise it" in done.stderr
 
