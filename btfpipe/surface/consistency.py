@@ -106,8 +106,8 @@ def consistent_positions(vertices, faces, normals, width):
     joined = _neighbour_matrix(faces, len(vertices))
     first, after = joined.indptr, joined.indices
     weight = np.empty(len(after))
-    degree, wanted, edge = (np.empty(len(vertices)) for _ in range(3))
-    _equations(vertices, normals, first, after, weight, degree, wanted, edge)
+    degree, wanted = np.empty((2, len(vertices)))
+    _equations(vertices, normals, first, after, weight, degree, wanted)
     pull = 1 / np.maximum(np.broadcast_to(width, len(vertices)), _NEAREST) ** 2
     heights = _solve(first, after, weight, degree + pull, wanted)
     return vertices + heights[:, None] * normals
@@ -125,12 +125,11 @@ def _neighbour_matrix(faces, count):
 
 
 @njit(cache=True, nogil=True)
-def _equations(vertices, normals, first, after, weight, degree, wanted, length):
-    """Weights of all edges, 0 across creases, their sums, the right-hand side, and mean lengths of edges."""
+def _equations(vertices, normals, first, after, weight, degree, wanted):
+    """Weights of all edges, 0 across creases, their sums, and the right-hand side."""
     for i in range(len(vertices)):
         degree[i] = 0.0
         wanted[i] = 0.0
-        length[i] = 0.0
         for e in range(first[i], first[i + 1]):
             j = after[e]
             rise = 0.0
@@ -146,7 +145,6 @@ def _equations(vertices, normals, first, after, weight, degree, wanted, length):
             weight[e] = 1.0 if smooth else 0.0
             degree[i] += weight[e]
             wanted[i] += weight[e] * rise
-            length[i] += np.sqrt(edge) / (first[i + 1] - first[i])
 
 
 @njit(cache=True, nogil=True)
